@@ -1,0 +1,216 @@
+"""Where a vehicle's nodes live: the part that shared memory and one process's memory have in common.
+
+A directory hands out process numbers, node buffers and sleepers' FIFOs, holds the lock under which
+tables and files change, and keeps this process's open `Node` objects.
+"""
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from threading import RLock
+from typing import TYPE_CHECKING
+
+from .layout import MAGIC, W_G, W_HINT, W_MAGIC, Label, Shape, format_node
+from .mapping import Mapping
+from .tables import sleeper_entries
+from .waking import End, forget_directory, poke
+
+if TYPE_CHECKING:
+    from .node import Node
+
+Filler = Callable[[Mapping], None]  # writes tables and samples into a node that has no name yet
+
+LOCK_WAIT = 5.0  # seconds; file work under the lock takes milliseconds
+BUS_SIZE = 4096
+B_PROCESS = 1  # word of .bus: the number last given to a process
+B_END = 2  # the number last given to a sleeper's FIFO
+B_HOLDER = 3  # process that holds the directory lock, for error messages
+B_HOST = 3072  # byte offset: length byte and name of the host, as its link gave it
+HOST_SIZE = 65
+
+
+def host_name() -> str:
+    """Return $UORB_HOST, else the system's host name."""
+    return os.environ.get("UORB_HOST") or os.uname().nodename
+
+
+class Directory(ABC):
+    """The nodes of one vehicle's bus, as this process sees them."""
+
+    path: str
+    single = False  # one process alone, for ever
+    me: int  # this process's number; never given to another
+    bulletin: "memoryview[int]"  # words of .bus: a generation and a sleeper table like a node's
+
+    def __init__(self) -> None:
+        self.nodes: dict[tuple[str, int], Node] = {}
+        self.closed = False
+
+    @abstractmethod
+    def hold(self, wait: float = LOCK_WAIT) -> AbstractContextManager[object]:
+        """Hold the directory lock; re-entrant. Raises BusError (EAGAIN) after `wait` seconds."""
+
+    @abstractmethod
+    def alive(self, process: int) -> bool:
+        """Tell whether the process of that number lives."""
+
+    @abstractmethod
+    def pid(self, process: int) -> int:
+        """Return the pid behind a process number, for messages only."""
+
+    @abstractmethod
+    def find(self, topic: str, instance: int, populate: bool = True) -> Mapping | None:
+        """Map an existing node; None if there is none. `populate` loads its pages now."""
+
+    @abstractmethod
+    def install(self, label: Label, shape: Shape, fill: Filler | None = None) -> Mapping:
+        """Build a node beside the others, let `fill` write into it, and give it its name."""
+
+    @abstractmethod
+    def names(self) -> list[tuple[str, int]]:
+        """List (topic, instance) of every node, sorted."""
+
+    @abstractmethod
+    def new_end(self) -> End:
+        """Make a FIFO for a sleeper."""
+
+    @abstractmethod
+    def own_ends(self) -> list[int]:
+        """List the numbers of this process's FIFOs."""
+
+    @abstractmethod
+    def end_of(self, number: int) -> int | None:
+        """Return a descriptor that writes to FIFO `number`; None if its owner is gone."""
+
+    @abstractmethod
+    def forget_end(self, number: int) -> None:
+        """Drop what is kept for FIFO `number`: its owner is dead."""
+
+    @abstractmethod
+    def lock_file(self, topic: str, instance: int, mapping: Mapping) -> int | None:
+        """Open a descriptor to flock for a node's writers; None if `mapping` has been replaced."""
+
+    @abstractmethod
+    def sweep(self) -> None:
+        """Remove what dead processes left behind (under the directory lock)."""
+
+    @property
+    def host(self) -> str:
+        """This host's name on the bus: its link's, else $UORB_HOST, else the system's."""
+        raw = self.bulletin.cast("B")[B_HOST : B_HOST + HOST_SIZE]
+        return bytes(raw[1 : 1 + raw[0]]).decode("utf-8", "replace") or host_name()
+
+    @host.setter
+    def host(self, name: str) -> None:
+        raw = name.encode()[: HOST_SIZE - 1]
+        self.bulletin.cast("B")[B_HOST : B_HOST + 1 + len(raw)] = bytes([len(raw)]) + raw
+
+    def poke(self, number: int) -> None:
+        """Wake the sleeper with FIFO `number`."""
+        fd = self.end_of(number)
+        if fd is not None and not poke(fd):
+            self.forget_end(number)
+
+    def dead_end(self, number: int) -> bool:
+        """Tell whether FIFO `number` has no owner any more."""
+        self.forget_end(number)
+        return self.end_of(number) is None
+
+    def announce(self) -> None:
+        """Step the bulletin (under the directory lock): something appeared, went or changed."""
+        words = self.bulletin
+        words[W_G] += 1
+        if words[W_HINT]:
+            wake(self, words)
+
+    def close(self) -> None:
+        """Give up this process's place in the directory; every node must be closed before."""
+        self.closed = True
+        forget_directory(self)
+
+    def abandon(self) -> None:
+        """Forget everything in a forked child: what is open there is its parent's."""
+        self.closed = True
+
+
+def wake(directory: Directory, words: "memoryview[int]") -> None:
+    """Wake every armed sleeper of a table. No lock: see docs/node.md, "Wake"."""
+    words[W_HINT] = 0
+    for index in sleeper_entries(words):
+        if words[index + 1]:
+            words[index + 1] = 0
+            directory.poke(words[index])
+
+
+class PrivateDirectory(Directory):
+    """A bus in this process's own memory: the same code on bytearrays."""
+
+    single = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.path = "(private)"
+        self.me = 1
+        self.bulletin = memoryview(bytearray(BUS_SIZE)).cast("Q")
+        self.bulletin[W_MAGIC] = MAGIC
+        self._lock = RLock()
+        self._files: dict[tuple[str, int], Mapping] = {}
+        self._ends: dict[int, End] = {}
+        self._count = 0
+
+    @contextmanager
+    def hold(self, wait: float = LOCK_WAIT) -> Iterator[None]:
+        with self._lock:
+            yield
+
+    def alive(self, process: int) -> bool:
+        return process == self.me
+
+    def pid(self, process: int) -> int:
+        return os.getpid()
+
+    def find(self, topic: str, instance: int, populate: bool = True) -> Mapping | None:
+        return self._files.get((topic, instance))
+
+    def install(self, label: Label, shape: Shape, fill: Filler | None = None) -> Mapping:
+        buffer = bytearray(shape.size)
+        format_node(buffer, label, shape)
+        self._count += 1
+        mapping = Mapping(buffer, self._count)
+        if fill is not None:
+            fill(mapping)
+        self._files[label.topic, label.instance] = mapping
+        return mapping
+
+    def names(self) -> list[tuple[str, int]]:
+        return sorted(self._files)
+
+    def new_end(self) -> End:
+        with self._lock:
+            self._count += 1
+            fd, write_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+            end = self._ends[self._count] = End(self._count, fd, write_fd)
+            return end
+
+    def own_ends(self) -> list[int]:
+        return list(self._ends)
+
+    def end_of(self, number: int) -> int | None:
+        end = self._ends.get(number)
+        return None if end is None else end.write_fd
+
+    def forget_end(self, number: int) -> None:
+        return  # own sleepers live as long as this process; `close` drops them
+
+    def lock_file(self, topic: str, instance: int, mapping: Mapping) -> int | None:
+        raise AssertionError("a private node has one publishing process")
+
+    def sweep(self) -> None:
+        return  # nobody else can have left anything
+
+    def close(self) -> None:
+        super().close()
+        for end in self._ends.values():
+            end.close()
+        self._ends.clear()

@@ -1,0 +1,348 @@
+"""One reader of a node: its position, its interval, what it lost; copy, check, update, wait.
+
+The arithmetic is docs/semantics.md, "Generations": a position is the number of the next write to
+read; generations are 62 bits wide and never wrap (at a million samples a second: 146,000 years).
+"""
+
+from collections.abc import Callable, Iterator
+from time import monotonic
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
+
+from .broker import members
+from .broker.layout import FLAG_LATCHED, GENERATION, MOVED, UNADVERTISED, W_FLOOR, W_G, W_PRIORITY
+from .broker.slots import Sample as Slot
+from .broker.slots import decoded, read
+from .errors import ClosedError, NoDataError
+from .waiting import wait_for
+
+if TYPE_CHECKING:
+    from .broker.node import Node
+    from .messages import Message, MessageType
+
+M = TypeVar("M", bound="Message")
+DEATH_CHECK = 0.5  # seconds between two looks whether the publishers of a node live
+STARTS = ("latest", "new", "oldest")
+
+
+class SampleInfo(NamedTuple):
+    """What the bus knows of a sample beside the message.
+
+    Times are microseconds of this host's clock; `published_us` is 0 while a remote clock's offset is
+    unknown. `generation` and `sequence` count from 1, `sequence` at the publisher's host.
+    """
+
+    generation: int
+    published_us: int
+    received_us: int
+    origin: str
+    sequence: int
+    latched: bool
+
+
+class Sample(NamedTuple, Generic[M]):
+    """A message with its info."""
+
+    message: M
+    info: SampleInfo
+
+
+class _Closed:
+    """Stands in for the words of a closed subscription: any access tells."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def __getitem__(self, index: int) -> int:
+        raise ClosedError(self._text)
+
+
+class Subscription(Generic[M]):
+    """A reader of one topic instance. Made by `Broker.subscribe`; lives until closed."""
+
+    __slots__ = (
+        "_closed", "_closed_by", "_decode", "_interval", "_last", "_lost", "_mapping", "_node", "_position",
+        "_quiet", "_words", "queue_size",
+    )  # fmt: skip
+
+    def __init__(
+        self, node: "Node", start: str, interval: float, on_close: Callable[["Subscription[Any]"], None]
+    ) -> None:
+        self._node = node
+        self._decode: Callable[[Any, int], M] = node.type.decode
+        self._interval = 0.0
+        self._last = 0.0
+        self._lost = 0
+        self._closed = False
+        self._closed_by = on_close
+        self.queue_size = 0
+        self._words: memoryview[int] = node.mapping.words
+        self._follow()
+        self._begin(start)
+        self._interval = _seconds(interval)
+        members.enlist(node, self)
+
+    def _begin(self, start: str) -> None:
+        word = self._words[W_G]
+        generation, floor = word & GENERATION, self._words[W_FLOOR]
+        if start == "new" or word & UNADVERTISED:
+            self._position = generation
+        elif start == "latest":
+            self._position = max(generation - 1, floor)
+        else:
+            self._position = max(generation - self._mapping.queue_length, floor)
+        self._quiet = self._position
+
+    # -- state -------------------------------------------------------------------------------------
+
+    @property
+    def topic(self) -> str:
+        """The topic's name."""
+        return self._node.label.topic
+
+    @property
+    def instance(self) -> int:
+        """The instance, 0..9."""
+        return self._node.label.instance
+
+    @property
+    def type(self) -> "MessageType":
+        """The message type in use on the node."""
+        return self._node.type
+
+    @property
+    def queue_length(self) -> int:
+        """How many samples readers of this node can still get one by one."""
+        self._current()
+        return self._mapping.queue_length
+
+    @property
+    def priority(self) -> int:
+        """The publisher's priority, 1..255; 75 for a node never advertised."""
+        self._current()
+        return self._words[W_PRIORITY]
+
+    @property
+    def generation(self) -> int:
+        """This subscription's position: the number of the next write it will read."""
+        self._words[W_G]
+        return self._position
+
+    @property
+    def lost(self) -> int:
+        """Samples overwritten before this subscription read them; counted by the copy that passes over."""
+        return self._lost
+
+    @property
+    def advertised(self) -> bool:
+        """Whether a live publisher advertises the node."""
+        word = self._current()
+        return not word & UNADVERTISED and self._published()
+
+    @property
+    def pending(self) -> int:
+        """Unread samples that can still be read one by one."""
+        word = self._current()
+        if word & UNADVERTISED:
+            return 0
+        return min(word - max(self._position, self._words[W_FLOOR]), self._mapping.queue_length)
+
+    @property
+    def interval(self) -> float:
+        """The least time between two updates, seconds; 0: none."""
+        return self._interval
+
+    @interval.setter
+    def interval(self, seconds: float) -> None:
+        self._words[W_G]
+        self._interval = _seconds(seconds)
+        self._quiet = -1
+        members.enlist(self._node, self)
+        self._node.poke_own()
+
+    @property
+    def interval_us(self) -> int:
+        """The interval in microseconds."""
+        return round(self._interval * 1e6)
+
+    # -- reading -----------------------------------------------------------------------------------
+
+    def check(self) -> bool:
+        """Tell whether an unread sample is there and the interval has passed. Changes nothing."""
+        word = self._words[W_G]
+        if word == self._quiet:
+            return False
+        return self._look(word)
+
+    def _look(self, word: int) -> bool:
+        """Answer `check` for a G that is not the one last answered no."""
+        if word >> 62:
+            word = self._current()
+            if word & UNADVERTISED:
+                self._quiet = word
+                return False
+        if word <= self._position or word <= self._words[W_FLOOR]:
+            self._quiet = word
+            return False
+        if self._interval and monotonic() - self._last < self._interval:
+            return False
+        return self._published()
+
+    def copy(self) -> M:
+        """Return the newest sample, or the next unread one of a queue.
+
+        Raises:
+            NoDataError: nothing was published in this advertisement, or nobody advertises.
+            ClosedError: the subscription is closed.
+        """
+        while True:
+            number, after = self._choose()
+            generation, message = self._node.cache
+            if generation != number + 1 or message is None:
+                message = decoded(self._mapping, number, self._decode)
+                if message is None:
+                    continue  # overtaken: choose again
+                self._node.cache = (number + 1, cast("Message", message))
+            self._advance(number, after)
+            return cast(M, message)
+
+    def copy_with_info(self) -> Sample[M]:
+        """Return what `copy` does, with its `SampleInfo`; raises as `copy`."""
+        while True:
+            number, after = self._choose()
+            slot = read(self._mapping, number)
+            if slot is not None:
+                break
+        self._advance(number, after)
+        return Sample(self._decode(slot.payload, 0), self._info(slot))
+
+    def update(self) -> M | None:
+        """Return `copy()` if `check()`, else None."""
+        return self.copy() if self.check() else None
+
+    def _choose(self) -> tuple[int, int]:
+        """Return the write to deliver and the position after it."""
+        word = self._words[W_G]
+        if word >> 62:
+            word = self._current()
+            if word & UNADVERTISED:
+                raise NoDataError(f"{self._node.name} is not advertised")
+        floor = self._words[W_FLOOR]
+        if word <= floor:
+            raise NoDataError(f"nothing was published on {self._node.name}")
+        length = self._mapping.queue_length
+        position = self._position
+        if length == 1 or self._interval or position >= word:
+            number = word - 1
+        else:
+            number = max(position, word - length, floor)
+        if not self._published():
+            raise NoDataError(f"the publisher of {self._node.name} is gone")
+        return number, max(number + 1, position)
+
+    def _advance(self, number: int, after: int) -> None:
+        passed = number - max(self._position, self._words[W_FLOOR])
+        if passed > 0 and not self._interval:
+            self._lost += passed
+            self._node.count_lost(passed)
+        self._position = self._quiet = after
+        now = monotonic()
+        interval = self._interval
+        self._last = min(max(self._last + interval, now - interval), now) if interval else now
+
+    def _info(self, slot: Slot) -> SampleInfo:
+        origin = self._mapping.origin(slot.origin) or self._node.directory.host
+        latched = bool(slot.flags & FLAG_LATCHED)
+        return SampleInfo(slot.number, slot.published_us, slot.received_us, origin, slot.sequence, latched)
+
+    def stat(self) -> int:
+        """Return when the node was last written, microseconds of this host's clock; 0 for never."""
+        while True:
+            word = self._current() & GENERATION
+            if not word:
+                return 0
+            slot = read(self._mapping, word - 1)
+            if slot is not None:
+                return slot.received_us
+
+    # -- waiting -----------------------------------------------------------------------------------
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Block until `check()` is true, at most `timeout` seconds (None: without limit)."""
+        return self.check() or bool(wait_for([self], timeout))
+
+    def due_in(self) -> float | None:
+        """Return the seconds until a sample held back by the interval is due; None if none is held."""
+        if not self._interval:
+            return None
+        word = self._words[W_G]
+        if word >> 62 or word <= max(self._position, self._words[W_FLOOR]):
+            return None
+        return max(self._last + self._interval - monotonic(), 0.0)
+
+    def __iter__(self) -> Iterator[M]:
+        while True:
+            self.wait()
+            message = self.update()
+            if message is not None:
+                yield message
+
+    # -- the node ----------------------------------------------------------------------------------
+
+    def _current(self) -> int:
+        """Return G, after following a node that was moved."""
+        while (word := self._words[W_G]) & MOVED:
+            self._node.recover()
+        return word
+
+    def _follow(self) -> None:
+        """Pick up the node's present buffer, unless closed meanwhile."""
+        if self._closed:
+            return
+        self._mapping = self._node.mapping
+        self._words = self._mapping.words
+
+    def _published(self) -> bool:
+        """Tell whether a publisher lives; asked of the kernel at most twice a second."""
+        node = self._node
+        if node.publishing:
+            return True
+        now = monotonic()
+        if now - node.checked < DEATH_CHECK:
+            return True
+        node.checked = now
+        if members.advertised(node.directory, self._mapping):
+            return True
+        node.checked = 0.0
+        return not members.bury(node.directory, node)
+
+    # -- closing -----------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Unsubscribe; waits on this subscription end with ClosedError. A second call does nothing."""
+        if self._closed:
+            return
+        self.spend()
+        members.unsubscribe(self._node, self)
+        self._closed_by(self)
+        self._node.poke_own()
+
+    def spend(self) -> None:
+        """Make every later call raise ClosedError."""
+        self._closed = True
+        self._words = cast("memoryview[int]", _Closed(f"subscription to {self._node.name} is closed"))
+        self._quiet = -1
+
+    def __enter__(self) -> "Subscription[M]":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Subscription {self._node.name}>"
+
+
+def _seconds(interval: float) -> float:
+    if not interval >= 0.0:
+        raise ValueError(f"interval = {interval!r}: seconds, 0 or more")
+    return float(interval)

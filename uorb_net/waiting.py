@@ -1,0 +1,100 @@
+"""Waiting for subscriptions: level triggered, without a thread that polls.
+
+Check, arm in each node's table, check again, sleep on one descriptor; look again after 2, 16 and
+128 ms and then every second, so that a wake-up lost to a killed publisher delays and never hangs.
+"""
+
+from collections.abc import Sequence
+from time import monotonic, sleep
+from typing import TYPE_CHECKING, Any
+
+from .broker.layout import W_HINT
+from .broker.waking import LOOKS, Sleeper, give_back, take
+
+if TYPE_CHECKING:
+    from .subscription import Subscription
+
+CROWDED = 0.005  # seconds between looks where a node's sleeper table is full
+
+
+def poll(
+    subscriptions: "Sequence[Subscription[Any]]", timeout: float | None = None
+) -> "list[Subscription[Any]]":
+    """Return those of `subscriptions` that have an update, in their order; wait for the first.
+
+    Args:
+        subscriptions: any number, also of several brokers. Level triggered: one that is not copied
+            is returned again by the next call.
+        timeout: seconds; None waits without limit, 0 or less does not wait.
+
+    Returns:
+        The ready ones; empty on timeout.
+
+    Raises:
+        ValueError: no subscription and no timeout, which would wait for ever.
+        ClosedError: one of them is closed, or is being closed meanwhile.
+    """
+    if not subscriptions:
+        if timeout is None:
+            raise ValueError("poll([]) without a timeout would wait for ever")
+        sleep(max(timeout, 0.0))
+        return []
+    return ready(subscriptions) or wait_for(subscriptions, timeout)
+
+
+def ready(subscriptions: "Sequence[Subscription[Any]]") -> "list[Subscription[Any]]":
+    """Return those that have an update now, each once."""
+    found = [subscription for subscription in subscriptions if subscription.check()]
+    return found if len(found) < 2 else list(dict.fromkeys(found))
+
+
+def wait_for(
+    subscriptions: "Sequence[Subscription[Any]]", timeout: float | None
+) -> "list[Subscription[Any]]":
+    """Sleep until one is ready; the caller has looked already and found none."""
+    if timeout is not None and timeout <= 0:
+        return []
+    deadline = None if timeout is None else monotonic() + timeout
+    sleeper = take()
+    try:
+        return _sleep(subscriptions, sleeper, deadline)
+    finally:
+        give_back(sleeper)
+
+
+def _sleep(
+    subscriptions: "Sequence[Subscription[Any]]", sleeper: Sleeper, deadline: float | None
+) -> "list[Subscription[Any]]":
+    look = 0
+    while True:
+        full = [subscription for subscription in subscriptions if not _arm(subscription, sleeper)]
+        found = ready(subscriptions)
+        if found:
+            return found
+        seconds = CROWDED if full else LOOKS[look]
+        for subscription in subscriptions:
+            due = subscription.due_in()
+            if due is not None and due < seconds:
+                seconds = due
+        if deadline is not None:
+            left = deadline - monotonic()
+            if left <= 0:
+                return []
+            seconds = min(seconds, left)
+        woken = sleeper.sleep(seconds)
+        look = 0 if woken else min(look + 1, len(LOOKS) - 1)
+        found = ready(subscriptions)
+        if found:
+            return found
+
+
+def _arm(subscription: "Subscription[Any]", sleeper: Sleeper) -> bool:
+    """Announce the sleeper in the subscription's node; False where the table is full."""
+    node = subscription._node
+    index = node.sleeper_index(sleeper.end(node.directory).number)
+    if index is None:
+        return False
+    words = node.mapping.words
+    words[index + 1] = 1
+    words[W_HINT] = 1  # after `armed`: see docs/node.md, "Races"
+    return True
