@@ -31,6 +31,11 @@ if TYPE_CHECKING:
     from .errors import TopicMismatchError as TopicMismatchError
     from .errors import UnknownTopicError as UnknownTopicError
     from .errors import UorbError as UorbError
+    from .link import Link as Link
+    from .link import LinkEvent as LinkEvent
+    from .link import LinkStats as LinkStats
+    from .link import PeerStatus as PeerStatus
+    from .link import TopicLinkStats as TopicLinkStats
     from .publication import Publication as Publication
     from .subscription import Sample as Sample
     from .subscription import SampleInfo as SampleInfo
@@ -40,6 +45,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "clock": ["hrt_absolute_time"],
     "broker": ["Broker", "Priority", "ORB_QUEUE_LENGTH_MAX", "TopicStatus"],
+    "link": ["Link", "LinkEvent", "LinkStats", "PeerStatus", "TopicLinkStats"],
     "publication": ["Publication"],
     "subscription": ["Subscription", "Sample", "SampleInfo"],
     "waiting": ["poll"],

@@ -96,6 +96,8 @@ class Publication(Generic[M]):
         members.unadvertise(self._node)
         self._closed_by(self)
 
+    close = unadvertise
+
     def spend(self) -> None:
         """Make every later publish raise ClosedError."""
         self._encode = _spent

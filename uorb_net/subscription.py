@@ -9,7 +9,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
 
 from .broker import members
-from .broker.layout import FLAG_LATCHED, GENERATION, MOVED, UNADVERTISED, W_FLOOR, W_G, W_PRIORITY
+from .broker.layout import FLAG_LATCHED, GENERATION, MOVED, UNADVERTISED, W_FLOOR, W_G, W_LAPSED, W_PRIORITY
 from .broker.slots import Sample as Slot
 from .broker.slots import decoded, read
 from .errors import ClosedError, NoDataError
@@ -86,10 +86,10 @@ class Subscription(Generic[M]):
         generation, floor = word & GENERATION, self._words[W_FLOOR]
         if start == "new" or word & UNADVERTISED:
             self._position = generation
-        elif start == "latest":
-            self._position = max(generation - 1, floor)
         else:
-            self._position = max(generation - self._mapping.queue_length, floor)
+            back = 1 if start == "latest" else self._mapping.queue_length
+            # Nothing from before a mirror's demand lapsed is an update: newer samples are missing behind it.
+            self._position = max(generation - back, floor, self._words[W_LAPSED])
         self._quiet = self._position
 
     # -- state -------------------------------------------------------------------------------------

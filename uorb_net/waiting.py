@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any
 
-from .broker.layout import W_HINT
 from .broker.waking import LOOKS, Sleeper, give_back, take
 
 if TYPE_CHECKING:
@@ -67,7 +66,10 @@ def _sleep(
 ) -> "list[Subscription[Any]]":
     look = 0
     while True:
-        full = [subscription for subscription in subscriptions if not _arm(subscription, sleeper)]
+        full = False
+        for subscription in subscriptions:
+            node = subscription._node
+            full |= not node.directory.arm(node.mapping.words, sleeper.end(node.directory).number)
         found = ready(subscriptions)
         if found:
             return found
@@ -86,15 +88,3 @@ def _sleep(
         found = ready(subscriptions)
         if found:
             return found
-
-
-def _arm(subscription: "Subscription[Any]", sleeper: Sleeper) -> bool:
-    """Announce the sleeper in the subscription's node; False where the table is full."""
-    node = subscription._node
-    index = node.sleeper_index(sleeper.end(node.directory).number)
-    if index is None:
-        return False
-    words = node.mapping.words
-    words[index + 1] = 1
-    words[W_HINT] = 1  # after `armed`: see docs/node.md, "Races"
-    return True

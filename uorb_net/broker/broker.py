@@ -13,6 +13,7 @@ from .shared import process_directory
 from .survey import TopicStatus, survey
 
 if TYPE_CHECKING:
+    from ..link import Link
     from ..messages import Message
     from ..publication import Publication
     from ..subscription import Subscription
@@ -55,7 +56,7 @@ class Broker:
 
     def _open(self, directory: Directory) -> None:
         self._directory = directory
-        self._users: set[Publication[Any] | Subscription[Any]] = set()
+        self._users: set[Publication[Any] | Subscription[Any] | Link] = set()
         self._closed = False
         _brokers.add(self)
 
@@ -249,7 +250,7 @@ class Broker:
             return
         for user in list(self._users):
             with suppress(BusError):  # the folder was removed: nothing left to leave
-                user.unadvertise() if hasattr(user, "unadvertise") else user.close()
+                user.close()
         self._closed = True
         _brokers.discard(self)
         if not any(broker._directory is self._directory for broker in _brokers):

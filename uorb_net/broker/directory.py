@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from .layout import MAGIC, W_G, W_HINT, W_MAGIC, Label, Shape, format_node
 from .mapping import Mapping
-from .tables import sleeper_entries
+from .tables import claim_sleeper, sleeper_entries
 from .waking import End, forget_directory, poke
 
 if TYPE_CHECKING:
@@ -116,6 +116,21 @@ class Directory(ABC):
         """Tell whether FIFO `number` has no owner any more."""
         self.forget_end(number)
         return self.end_of(number) is None
+
+    def arm(self, words: "memoryview[int]", number: int) -> bool:
+        """Announce sleeper `number` in a node's table; False where the table is full of the living."""
+        for index in sleeper_entries(words):
+            if words[index] == number:
+                break
+        else:
+            with self.hold():
+                claimed = claim_sleeper(words, number, self.dead_end)
+            if claimed is None:
+                return False
+            index = claimed
+        words[index + 1] = 1
+        words[W_HINT] = 1  # after `armed`: see docs/node.md, "Races"
+        return True
 
     def announce(self) -> None:
         """Step the bulletin (under the directory lock): something appeared, went or changed."""

@@ -212,6 +212,11 @@ def advertised(directory: Directory, mapping: Mapping) -> bool:
     return any(directory.alive(share.process) for share in shares(mapping.words))
 
 
+def owned(directory: Directory, mapping: Mapping) -> bool:
+    """Tell whether a live publisher made with advertise_multi holds the node. No lock needed."""
+    return any(share.own and directory.alive(share.process) for share in shares(mapping.words))
+
+
 def readable(mapping: Mapping) -> bool:
     """Tell whether the present advertisement has data."""
     return (mapping.words[W_G] & GENERATION) > mapping.words[W_FLOOR]

@@ -18,7 +18,7 @@ from ..errors import BusyError, ClosedError
 from .directory import Directory, wake
 from .layout import GENERATION, MOVED, UNADVERTISED, W_BUSY, W_G, W_HINT, W_REMOTE, W_SHARED, Label
 from .mapping import Mapping
-from .tables import claim_sleeper, release_sleeper, shares, sleeper_entries
+from .tables import release_sleeper, shares, sleeper_entries
 
 if TYPE_CHECKING:
     from ..messages import Message, MessageType
@@ -299,15 +299,6 @@ class Node:
         with self._lock:
             if self.subscriber:
                 self.mapping.words[self.subscriber + 3] += count
-
-    def sleeper_index(self, number: int) -> int | None:
-        """Return the table entry of FIFO `number`, claimed if need be; None if the table is full."""
-        words = self.mapping.words
-        for index in sleeper_entries(words):
-            if words[index] == number:
-                return index
-        with self.directory.hold():
-            return claim_sleeper(self.mapping.words, number, self.directory.dead_end)
 
     def forget_sleepers(self, numbers: list[int]) -> None:
         """Free the entries of this process's FIFOs (under the directory lock)."""

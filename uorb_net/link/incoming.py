@@ -1,0 +1,186 @@
+"""What other hosts offer, mirrored on this bus: one mirror per remote topic instance.
+
+Bytes are checked for length and header and written as they came, below the publish layer, so nothing
+received is ever sent on. Numbers that are missing and were not withheld are asked for once where the
+topic has a queue, and count as lost if the sender's ring has them no more.
+"""
+
+from collections.abc import Callable
+from threading import Lock
+from time import monotonic
+
+from communicator import Advert, Peer, SampleHeader
+
+from ..broker.layout import FLAG_LATCHED
+from ..broker.node import Node
+from ..clock import hrt_absolute_time
+from ..errors import BusyError, ClosedError
+from .peers import PeerState
+from .status import TopicLinkStats
+
+GAP_WAIT = 0.5  # seconds a queued topic waits for what it asked for; well below the lease
+WAITING = 256  # samples of one stream kept while a gap is asked for
+STUCK_PAUSE = 1.0  # seconds a node is left alone after a process stopped inside it
+
+AskGap = Callable[["Mirror", int, int], None]
+
+
+class Mirror:
+    """One remote topic instance. Written by its stream's receiving thread, steered by the link's."""
+
+    def __init__(self, state: PeerState, advert: Advert) -> None:
+        self.state = state
+        self.peer: Peer = state.peer
+        self.advert = advert
+        self.node: Node | None = None
+        self.origin = 0  # index of the host in the node's origin table
+        self.demand_us: int | None = None  # the interval asked for; None: nobody here subscribes
+        self.base = True  # the next sample sets the base: nothing before it is loss
+        self.newest = 0  # highest sequence written
+        self.waiting: dict[int, tuple[SampleHeader, bytes]] = {}
+        self._asked = 0.0  # when the present gap was asked for; 0: none
+        self._asked_last = 0  # the last number asked for
+        self._lock = Lock()  # a stream's samples and its heads come in different threads
+        self.stuck_until = 0.0
+        self.refused = ""  # why it has no node, as last told
+        self.received = 0
+        self.lost = 0
+        self.retransmitted = 0
+        self.thinned = 0
+
+    @property
+    def name(self) -> str:
+        """The topic as its own host numbers it."""
+        return f"{self.advert.topic}.{self.advert.instance}" if self.advert.instance else self.advert.topic
+
+    @property
+    def instance(self) -> int | None:
+        """The number on this host; None while it has none."""
+        return None if self.node is None else self.node.label.instance
+
+    def receive(self, header: SampleHeader, payload: bytes, ask: AskGap) -> bool:
+        """Take a sample; False if its bytes cannot be the topic's."""
+        if len(payload) != self.advert.payload_length or payload[:2] != b"\x00\x01":
+            return False
+        with self._lock:
+            if self.base and header.sequence != self.newest:
+                self.newest = header.sequence - 1
+            self.base = False
+            if header.sequence <= self.newest:
+                return True  # a second copy, or the latched sample that is here already
+            missing = header.sequence - self.newest - 1 - header.withheld
+            if missing <= 0 or not self._hold(header, payload, ask):
+                self._take(header, payload)
+                self._release()
+        return True
+
+    def _hold(self, header: SampleHeader, payload: bytes, ask: AskGap) -> bool:
+        """Keep a sample while what is missing before it is asked for; False if it is not worth waiting."""
+        if self.advert.queue_length == 1 or len(self.waiting) >= WAITING:
+            return False
+        self.waiting[header.sequence] = (header, payload)
+        self._ask(header.sequence - 1, ask)
+        return True
+
+    def _ask(self, last: int, ask: AskGap) -> None:
+        if not self._asked:
+            self._asked = monotonic()
+            self._asked_last = last
+            ask(self, self.newest + 1, last)
+
+    def _release(self) -> None:
+        """Write waiting samples that are in order now."""
+        while self.waiting:
+            first = min(self.waiting)
+            header, payload = self.waiting[first]
+            if first - self.newest - 1 > header.withheld:
+                return
+            del self.waiting[first]
+            if first > self.newest:
+                self._take(header, payload)
+        if self.newest >= self._asked_last:
+            self._asked = 0.0
+
+    def give_up(self, now: float) -> None:
+        """Count as lost what was asked for and did not come, and go on with what waits."""
+        with self._lock:
+            if not self._asked or now - self._asked < GAP_WAIT:
+                return
+            while self.waiting:
+                first = min(self.waiting)
+                header, payload = self.waiting.pop(first)
+                if first > self.newest:
+                    self._take(header, payload)
+            if self.newest < self._asked_last:
+                self._count_lost(self._asked_last - self.newest)
+                self.newest = self._asked_last
+            self._asked = 0.0
+
+    def head(self, sequence: int, ask: AskGap) -> None:
+        """Learn the newest number the sender has sent: a lost last sample shows here."""
+        with self._lock:
+            if self.base or sequence <= self.newest or self.waiting:
+                return
+            if self.advert.queue_length > 1:
+                self._ask(sequence, ask)
+            else:
+                self._count_lost(sequence - self.newest)
+                self.newest = sequence
+
+    def begin(self, interval_us: int) -> None:
+        """Somebody here subscribes (again): the next sample sets the base."""
+        with self._lock:
+            self.base = True
+            self.demand_us = interval_us
+
+    def end(self) -> None:
+        """Nobody here subscribes any more."""
+        with self._lock:
+            self.demand_us = None
+            self.waiting.clear()
+            self._asked = 0.0
+
+    def _take(self, header: SampleHeader, payload: bytes) -> None:
+        missing = header.sequence - self.newest - 1
+        withheld = min(header.withheld, missing)
+        self.thinned += withheld
+        self._count_lost(missing - withheld)
+        self.newest = header.sequence
+        if self._asked and header.sequence <= self._asked_last:
+            self.retransmitted += 1
+        self._write(header, payload)
+
+    def _write(self, header: SampleHeader, payload: bytes) -> None:
+        node = self.node
+        now = hrt_absolute_time()
+        if node is None or monotonic() < self.stuck_until:
+            self._count_lost(1)
+            return
+        published = min(self.state.local_us(header.published_us), now)
+        flags = FLAG_LATCHED if header.latched else 0
+        try:
+            node.write(payload, published, now, header.sequence, self.origin, flags)
+        except BusyError:
+            self.stuck_until = monotonic() + STUCK_PAUSE
+            self._count_lost(1)
+        except ClosedError:
+            self._count_lost(1)  # withdrawn at this moment; the link's thread finds out by itself
+        else:
+            self.received += 1
+            self.state.received += 1
+
+    def _count_lost(self, count: int) -> None:
+        self.lost += count
+        self.state.lost += count
+
+    def stats(self) -> TopicLinkStats:
+        """Return the totals."""
+        return TopicLinkStats(
+            topic=self.advert.topic,
+            instance=self.advert.instance,
+            origin=self.peer.host,
+            received=self.received,
+            lost=self.lost,
+            retransmitted=self.retransmitted,
+            thinned=self.thinned,
+        )
