@@ -136,7 +136,7 @@ class Subscription(Generic[M]):
     def advertised(self) -> bool:
         """Whether a live publisher advertises the node."""
         word = self._current()
-        return not word & UNADVERTISED and self._published()
+        return not word & UNADVERTISED and (self._node.publishing > 0 or self._published())
 
     @property
     def pending(self) -> int:
@@ -185,7 +185,7 @@ class Subscription(Generic[M]):
             return False
         if self._interval and monotonic() - self._last < self._interval:
             return False
-        return self._published()
+        return self._node.publishing > 0 or self._published()
 
     def copy(self) -> M:
         """Return the newest sample, or the next unread one of a queue.
@@ -195,59 +195,65 @@ class Subscription(Generic[M]):
             ClosedError: the subscription is closed.
         """
         while True:
-            number, after = self._choose()
-            generation, message = self._node.cache
-            if generation != number + 1 or message is None:
-                message = decoded(self._mapping, number, self._decode)
-                if message is None:
-                    continue  # overtaken: choose again
+            number = self._choose()
+            generation, cached = self._node.cache
+            if generation == number + 1:
+                self._advance(number)
+                return cast(M, cached)
+            message = decoded(self._mapping, number, self._decode)
+            if message is not None:
                 self._node.cache = (number + 1, cast("Message", message))
-            self._advance(number, after)
-            return cast(M, message)
+                self._advance(number)
+                return message
+            # Overtaken while reading: choose again.
 
     def copy_with_info(self) -> Sample[M]:
         """Return what `copy` does, with its `SampleInfo`; raises as `copy`."""
         while True:
-            number, after = self._choose()
+            number = self._choose()
             slot = read(self._mapping, number)
             if slot is not None:
-                break
-        self._advance(number, after)
-        return Sample(self._decode(slot.payload, 0), self._info(slot))
+                self._advance(number)
+                return Sample(self._decode(slot.payload, 0), self._info(slot))
 
     def update(self) -> M | None:
         """Return `copy()` if `check()`, else None."""
         return self.copy() if self.check() else None
 
-    def _choose(self) -> tuple[int, int]:
-        """Return the write to deliver and the position after it."""
-        word = self._words[W_G]
+    def _choose(self) -> int:
+        """Return the number of the write to deliver."""
+        words = self._words
+        word = words[W_G]
         if word >> 62:
             word = self._current()
             if word & UNADVERTISED:
                 raise NoDataError(f"{self._node.name} is not advertised")
-        floor = self._words[W_FLOOR]
+            words = self._words
+        floor = words[W_FLOOR]
         if word <= floor:
             raise NoDataError(f"nothing was published on {self._node.name}")
-        length = self._mapping.queue_length
-        position = self._position
-        if length == 1 or self._interval or position >= word:
-            number = word - 1
-        else:
-            number = max(position, word - length, floor)
-        if not self._published():
+        if not (self._node.publishing or self._published()):
             raise NoDataError(f"the publisher of {self._node.name} is gone")
-        return number, max(number + 1, position)
+        length = self._mapping.queue_length
+        if length == 1 or self._position >= word or self._interval:
+            return word - 1
+        return max(self._position, word - length, floor)
 
-    def _advance(self, number: int, after: int) -> None:
-        passed = number - max(self._position, self._words[W_FLOOR])
-        if passed > 0 and not self._interval:
-            self._lost += passed
-            self._node.count_lost(passed)
-        self._position = self._quiet = after
+    def _advance(self, number: int) -> None:
+        """Move behind a delivered write, counting what it passed over."""
         now = monotonic()
+        passed = number - self._position
+        if passed >= 0:
+            self._position = self._quiet = number + 1
+            if passed and not self._interval:
+                self._count_lost(number, passed)
         interval = self._interval
         self._last = min(max(self._last + interval, now - interval), now) if interval else now
+
+    def _count_lost(self, number: int, passed: int) -> None:
+        passed = min(passed, number - self._words[W_FLOOR])  # an earlier advertisement's are not lost
+        self._lost += passed
+        self._node.count_lost(passed)
 
     def _info(self, slot: Slot) -> SampleInfo:
         origin = self._mapping.origin(slot.origin) or self._node.directory.host
@@ -304,8 +310,6 @@ class Subscription(Generic[M]):
     def _published(self) -> bool:
         """Tell whether a publisher lives; asked of the kernel at most twice a second."""
         node = self._node
-        if node.publishing:
-            return True
         now = monotonic()
         if now - node.checked < DEATH_CHECK:
             return True

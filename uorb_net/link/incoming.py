@@ -127,11 +127,10 @@ class Mirror:
                 self._count_lost(sequence - self.newest)
                 self.newest = sequence
 
-    def begin(self, interval_us: int) -> None:
+    def begin(self) -> None:
         """Somebody here subscribes (again): the next sample sets the base."""
         with self._lock:
             self.base = True
-            self.demand_us = interval_us
 
     def end(self) -> None:
         """Nobody here subscribes any more."""

@@ -14,6 +14,7 @@ from ..broker.mapping import Mapping
 from ..broker.slots import Sample, read
 from ..broker.tables import shares, subscriber_entries
 from ..clock import hrt_absolute_time
+from . import control
 
 HEADS_FOR = 4.0  # seconds: longer than a cut that the default lease survives
 
@@ -188,3 +189,115 @@ class LocalNode:
     def moved(self) -> bool:
         """Whether another buffer took this one's name."""
         return bool(self.mapping.words[W_G] & MOVED)
+
+
+class Offers:
+    """All nodes of this host's bus, as the link announces and sends them; steered by its thread alone."""
+
+    def __init__(self, directory: Directory, channel: Channel) -> None:
+        self.nodes: dict[tuple[str, int], LocalNode] = {}
+        self.sent = 0
+        self._directory = directory
+        self._channel = channel
+        self._flowing: list[LocalNode] = []
+
+    def survey(self) -> None:
+        """Follow the directory: announce what appeared, take back what went."""
+        names = set(self._directory.names())
+        for key in [key for key in self.nodes if key not in names]:
+            self._forget(key)
+        for key in names:
+            node = self.nodes.get(key)
+            if node is None or node.moved:
+                node = self._open(key, node)
+            if node is not None:
+                self._follow(key, node)
+
+    def _open(self, key: tuple[str, int], old: LocalNode | None) -> LocalNode | None:
+        mapping = self._directory.find(*key, populate=False)
+        if mapping is None:
+            return None
+        node = LocalNode(mapping)
+        if old is not None and old.label.type_hash == node.label.type_hash:
+            node.continue_from(old)
+        elif old is not None:
+            self._forget(key)
+        self.nodes[key] = node
+        self._note_flowing()
+        return node
+
+    def _follow(self, key: tuple[str, int], node: LocalNode) -> None:
+        node.look(self._directory)
+        advert = node.offer(self._directory)
+        if advert == node.advert:
+            return
+        node.advert = advert
+        if advert is not None:
+            self._channel.topic_advertised(advert)
+        else:
+            self._channel.topic_unadvertised(*key)
+
+    def _forget(self, key: tuple[str, int]) -> None:
+        node = self.nodes.pop(key)
+        if node.advert is not None:
+            self._channel.topic_unadvertised(*key)
+        self._note_flowing()
+
+    def _note_flowing(self) -> None:
+        self._flowing = [node for node in self.nodes.values() if node.flows]
+
+    # -- peers' wishes -----------------------------------------------------------------------------
+
+    def subscribe(self, peer: Peer, topic: str, instance: int, interval_us: int) -> None:
+        """Start or change a peer's flow."""
+        node = self.nodes.get((topic, instance))
+        if node is not None:
+            self.sent += node.subscribe(peer, interval_us, self._channel)
+            self._note_flowing()
+
+    def unsubscribe(self, peer: Peer, topic: str, instance: int) -> None:
+        """End a peer's flow."""
+        node = self.nodes.get((topic, instance))
+        if node is not None:
+            node.flows.pop(peer, None)
+            self._note_flowing()
+
+    def drop_peer(self, peer: Peer) -> None:
+        """End all flows of a peer."""
+        for node in self._flowing:
+            node.flows.pop(peer, None)
+        self._note_flowing()
+
+    def resend(self, peer: Peer, message: control.Gap) -> None:
+        """Answer a request for what a peer missed."""
+        node = self.nodes.get((message.topic, message.instance))
+        if node is not None:
+            self.sent += node.resend(peer, message.first, message.last, self._channel)
+
+    # -- sending -----------------------------------------------------------------------------------
+
+    def send_due(self) -> None:
+        """Queue what is new or due in every flowing node."""
+        now_us = hrt_absolute_time()
+        for node in self._flowing:
+            self.sent += node.send_due(self._channel, now_us)
+
+    def arm(self, number: int) -> bool:
+        """Announce sleeper `number` in every flowing node; False if one has moved on meanwhile."""
+        for node in self._flowing:
+            self._directory.arm(node.mapping.words, number)
+        return all(node.mapping.words[W_G] == node.seen for node in self._flowing)
+
+    def due_in(self) -> float | None:
+        """Return the seconds until a held-back sample is due; None if none waits."""
+        due = [when for node in self._flowing if (when := node.next_due_us()) is not None]
+        return (min(due) - hrt_absolute_time()) / 1e6 if due else None
+
+    def heads(self, now: float) -> dict[Peer, list[tuple[str, int, int]]]:
+        """Return the newest numbers worth repeating, by peer (`now`: monotonic seconds)."""
+        heads: dict[Peer, list[tuple[str, int, int]]] = {}
+        for node in self._flowing:
+            for flow in node.changed_flows(now):
+                row = (node.label.topic, node.label.instance, flow.sequence)
+                heads.setdefault(flow.peer, []).append(row)
+        return heads
