@@ -14,7 +14,7 @@ from .survey import TopicStatus, survey
 
 if TYPE_CHECKING:
     from ..link import Link
-    from ..messages import Message
+    from ..messages import Message, MessageType
     from ..publication import Publication
     from ..subscription import Subscription
 
@@ -135,26 +135,34 @@ class Broker:
             raise ValueError(f"priority = {priority}: 1..255")
         return self._advertise(topic, None, data, priority, queue_length)
 
+    def advertise_instance(
+        self,
+        type: "type[Message]",
+        topic: str,
+        instance: int,
+        *,
+        priority: int = Priority.DEFAULT,
+        queue_length: int | None = None,
+    ) -> "Publication[Any]":
+        """Become a publisher of a given instance, also where lower ones are missing: for replayed logs.
+
+        Args:
+            type: the message type; `topic` need not be one of its own.
+            topic: the topic's name.
+            instance: 0..9; others may share it.
+            priority, queue_length: as for `advertise`.
+        """
+        self._alive()
+        if not 0 <= instance < members.INSTANCES:
+            raise InstanceError(f"instance = {instance}: 0..{members.INSTANCES - 1}")
+        return self._join(type.__uorb__, topic, instance, int(priority), queue_length)
+
     def _advertise(
         self, topic: Any, instance: int | None, data: Any, priority: int, queue_length: int | None
     ) -> "Publication[Any]":
-        from ..publication import Publication
-
         self._alive()
-        if queue_length is not None and not 1 <= queue_length <= ORB_QUEUE_LENGTH_MAX:
-            raise QueueLengthError(f"queue_length = {queue_length}: 1..{ORB_QUEUE_LENGTH_MAX}")
         name, type_ = self._resolve(topic, instance or 0)
-        node = members.advertise(
-            self._directory,
-            type_.__uorb__,
-            name,
-            instance,
-            priority=int(priority),
-            queue_length=queue_length,
-            own=instance is None,
-        )
-        publication: Publication[Any] = Publication(node, int(priority), self._users.discard)
-        self._users.add(publication)
+        publication = self._join(type_.__uorb__, name, instance, int(priority), queue_length)
         if data is not None:
             try:
                 publication.publish(data)
@@ -163,18 +171,56 @@ class Broker:
                 raise
         return publication
 
+    def _join(
+        self, type_: "MessageType", name: str, instance: int | None, priority: int, queue_length: int | None
+    ) -> "Publication[Any]":
+        from ..publication import Publication
+
+        if queue_length is not None and not 1 <= queue_length <= ORB_QUEUE_LENGTH_MAX:
+            raise QueueLengthError(f"queue_length = {queue_length}: 1..{ORB_QUEUE_LENGTH_MAX}")
+        node = members.advertise(
+            self._directory,
+            type_,
+            name,
+            instance,
+            priority=priority,
+            queue_length=queue_length,
+            own=instance is None,
+        )
+        publication: Publication[Any] = Publication(node, priority, self._users.discard)
+        self._users.add(publication)
+        return publication
+
     # -- subscribing -------------------------------------------------------------------------------
 
     @overload
     def subscribe(
-        self, topic: type[M], instance: int = 0, *, interval: float = 0.0, start: str = "latest"
+        self,
+        topic: type[M],
+        instance: int = 0,
+        *,
+        interval: float = 0.0,
+        start: str = "latest",
+        definition: str = "own",
     ) -> "Subscription[M]": ...
     @overload
     def subscribe(
-        self, topic: Any, instance: int = 0, *, interval: float = 0.0, start: str = "latest"
+        self,
+        topic: Any,
+        instance: int = 0,
+        *,
+        interval: float = 0.0,
+        start: str = "latest",
+        definition: str = "own",
     ) -> "Subscription[Any]": ...
     def subscribe(
-        self, topic: Any, instance: int = 0, *, interval: float = 0.0, start: str = "latest"
+        self,
+        topic: Any,
+        instance: int = 0,
+        *,
+        interval: float = 0.0,
+        start: str = "latest",
+        definition: str = "own",
     ) -> "Subscription[Any]":
         """Become a reader; works before anyone advertises.
 
@@ -185,6 +231,8 @@ class Broker:
             interval: the least seconds between two updates; 0: every sample.
             start: what counts as an update at first: "latest" the newest sample there is, "new" only
                 later ones, "oldest" all that the queue retains.
+            definition: "own" reads with the definition installed here; "publisher" with the one the
+                topic's publisher brought, whatever is installed: for tools that read any topic.
 
         Raises:
             UnknownTopicError, TopicMismatchError, InstanceError: the call is wrong.
@@ -197,7 +245,10 @@ class Broker:
             raise ValueError(f"start = {start!r}: one of {', '.join(STARTS)}")
         if not 0 <= instance < members.INSTANCES:
             raise InstanceError(f"instance = {instance}: 0..{members.INSTANCES - 1}")
-        name, type_ = self._resolve(topic, instance)
+        if definition not in ("own", "publisher"):
+            raise ValueError(f"definition = {definition!r}: own or publisher")
+        found = self._published(topic, instance) if definition == "publisher" else None
+        name, type_ = found or self._resolve(topic, instance)
         node = members.subscribe(self._directory, type_.__uorb__, name, instance)
         subscription: Subscription[Any] = Subscription(node, start, interval, self._users.discard)
         self._users.add(subscription)
@@ -235,12 +286,23 @@ class Broker:
         try:
             return name, messages.type_for_topic(name)
         except UnknownTopicError:
-            for known in (instance, *range(members.INSTANCES)):
-                mapping = self._directory.find(name, known, populate=False) if name.isidentifier() else None
-                if mapping is not None:
-                    label = mapping.label()
-                    return name, messages.from_text(label.type_name, label.definition)
-            raise
+            found = self._published(name, instance)
+            if found is None:
+                raise
+            return found
+
+    def _published(self, name: Any, instance: int) -> "tuple[str, type[Message]] | None":
+        """Return a topic's name and type as the bus has them; None if it has no such node."""
+        from .. import messages
+
+        if not isinstance(name, str) or not name.isidentifier():
+            return None
+        for known in (instance, *range(members.INSTANCES)):
+            mapping = self._directory.find(name, known, populate=False)
+            if mapping is not None:
+                label = mapping.label()
+                return name, messages.from_text(label.type_name, label.definition)
+        return None
 
     # -- closing -----------------------------------------------------------------------------------
 

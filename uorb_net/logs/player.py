@@ -30,7 +30,7 @@ class Series(msgspec.Struct, frozen=True, eq=False):
     """A topic instance of a log, as the sink advertises it.
 
     Attributes:
-        topic: its name, the one the log gives.
+        topic: the log's name for it, mended where no topic may be called so.
         instance: its number in the log.
         type_name: CamelCase name of its message type.
         definition: self-contained .msg text of the type.
@@ -91,7 +91,7 @@ class Played(NamedTuple):
 
 
 SeriesMap = Mapping[tuple[str, int], Series]
-"""The series to play, by topic and instance."""
+"""The series to play, by the log's topic and instance."""
 
 
 def select(log: Summary, topics: Sequence[str] | None = None) -> dict[tuple[str, int], Series]:
@@ -113,7 +113,7 @@ def select(log: Summary, topics: Sequence[str] | None = None) -> dict[tuple[str,
         if coder is None:
             coder = transcoders[entry.topic] = Transcoder(entry.topic, log.formats)
         chosen[entry.topic, entry.instance] = Series(
-            topic=entry.topic,
+            topic=coder.topic,
             instance=entry.instance,
             type_name=coder.type_name,
             definition=coder.definition,

@@ -50,7 +50,49 @@ def type_names(formats: Iterable[str]) -> dict[str, str]:
 def _camel(name: str) -> str:
     words = re.split(r"[^A-Za-z0-9]+", name)
     camel = "".join(word[0].upper() + word[1:] for word in words if word)
-    return camel if camel[:1].isalpha() else "T" + camel
+    return camel if camel[:1].isalpha() and not keyword.iskeyword(camel) else "T" + camel
+
+
+def topic_names(formats: Iterable[str]) -> dict[str, str]:
+    """Give each format name of a log its topic: the name itself, wherever a topic may have it.
+
+    ULog also allows ``-``, ``/`` and a digit in front; such names are mended as ``field_names`` does.
+    """
+    names = list(formats)
+    return dict(zip(names, _distinct(names, _identifier), strict=True))
+
+
+def field_names(fields: Iterable[Field]) -> list[str]:
+    """Return the .msg names of a format's fields, one for each that is no padding.
+
+    ULog allows names a definition cannot have. Other characters than letters, digits and ``_``
+    become ``_``, leading underscores fall away, ``f_`` goes before what then begins with no letter,
+    a Python keyword gets ``_`` behind it; a name then taken gets ``_2``, ``_3`` and so on.
+    """
+    return _distinct([field.name for field in fields if not field.is_padding], _attribute)
+
+
+def _identifier(name: str) -> str:
+    name = re.sub(r"[^A-Za-z0-9_]", "_", name).lstrip("_")
+    return name if name[:1].isalpha() else "f_" + name
+
+
+def _attribute(name: str) -> str:
+    name = _identifier(name)
+    return name + "_" if keyword.iskeyword(name) else name
+
+
+def _distinct(names: list[str], mend: Callable[[str], str]) -> list[str]:
+    """Mend names and keep them apart; a name that is good as it is never yields to a mended one."""
+    used = {name for name in names if mend(name) == name}
+    seen: set[str] = set()
+    result = []
+    for name in names:
+        good = mend(name) == name and name not in seen
+        result.append(name if good else _free(mend(name), "_", used))
+        used.add(result[-1])
+        seen.add(name)
+    return result
 
 
 def _free(name: str, joint: str, used: set[str]) -> str:
@@ -58,35 +100,6 @@ def _free(name: str, joint: str, used: set[str]) -> str:
     while candidate in used:
         candidate, n = f"{name}{joint}{n}", n + 1
     return candidate
-
-
-def field_names(fields: Iterable[Field]) -> list[str]:
-    """Return the .msg names of a format's fields, one for each that is no padding.
-
-    ULog allows names a definition cannot have. Other characters than letters, digits and ``_``
-    become ``_``, leading underscores fall away, a leading digit gets ``f_`` before it, a Python
-    keyword ``_`` behind it; a name then taken gets ``_2``, ``_3`` and so on.
-    """
-    raw = [field.name for field in fields if not field.is_padding]
-    # Names that are good as they are come first, so that a repaired one never displaces them.
-    used = {name for name in raw if _repaired(name) == name}
-    seen: set[str] = set()
-    result = []
-    for name in raw:
-        fixed = _repaired(name)
-        if fixed != name or name in seen:
-            fixed = _free(fixed, "_", used)
-        used.add(fixed)
-        seen.add(name)
-        result.append(fixed)
-    return result
-
-
-def _repaired(name: str) -> str:
-    name = re.sub(r"[^A-Za-z0-9_]", "_", name).lstrip("_")
-    if not name[:1].isalpha():
-        name = "f_" + name
-    return name + "_" if keyword.iskeyword(name) else name
 
 
 def definition_text(name: str, formats: Mapping[str, Format]) -> str:
@@ -99,10 +112,11 @@ def definition_text(name: str, formats: Mapping[str, Format]) -> str:
         LogError: the format or a nested one is missing or cannot be laid out.
     """
     _measured(name, formats)
-    names = type_names(formats)
-    text = _own_text(formats[name], names)
+    types, topics = type_names(formats), topic_names(formats)
+    text = _own_text(formats[name], types, topics)
     for nested in _nested(name, formats):
-        text += f"{SEPARATOR}\nMSG: {_PACKAGE}/{names[nested]}\n{_own_text(formats[nested], names)}"
+        text += f"{SEPARATOR}\nMSG: {_PACKAGE}/{types[nested]}\n"
+        text += _own_text(formats[nested], types, topics)
     return text
 
 
@@ -125,14 +139,14 @@ def _nested(name: str, formats: Mapping[str, Format]) -> list[str]:
     return found
 
 
-def _own_text(fmt: Format, names: Mapping[str, str]) -> str:
-    lines = [f"# TOPICS {fmt.name}"]
+def _own_text(fmt: Format, types: Mapping[str, str], topics: Mapping[str, str]) -> str:
+    lines = [f"# TOPICS {topics[fmt.name]}"]
     if not _has_timestamp(fmt):
         # The grammar would add it silently; written out, every reader of the text agrees.
         lines.append(f"uint64 {_TIMESTAMP}")
     shown = [field for field in fmt.fields if not field.is_padding]
     for field, name in zip(shown, field_names(shown)):
-        lines.append(f"{_type_text(field, names)} {name}")
+        lines.append(f"{_type_text(field, types)} {name}")
     return "\n".join(lines) + "\n"
 
 
@@ -140,11 +154,11 @@ def _has_timestamp(fmt: Format) -> bool:
     return any(field.name == _TIMESTAMP for field in fmt.fields)
 
 
-def _type_text(field: Field, names: Mapping[str, str]) -> str:
+def _type_text(field: Field, types: Mapping[str, str]) -> str:
     if field.type in PRIMITIVES:
         base = _RENAMED.get(field.type, field.type.removesuffix("_t"))
     else:
-        base = names[field.type]
+        base = types[field.type]
     return f"{base}[{field.count}]" if field.count else base
 
 
@@ -152,12 +166,13 @@ class Transcoder:
     """Turns the rows of one format into encoded messages of its definition.
 
     Attributes:
+        topic: the topic's name, see ``topic_names``.
         type_name: CamelCase name of the message type.
         definition: self-contained definition text, see ``definition_text``.
         encoded_size: bytes of every encoded message, header included.
     """
 
-    __slots__ = ("_encode", "_needed", "definition", "encoded_size", "type_name")
+    __slots__ = ("_encode", "_needed", "definition", "encoded_size", "topic", "type_name")
 
     def __init__(self, name: str, formats: Mapping[str, Format]) -> None:
         """Prepare for the format called ``name``.
@@ -166,6 +181,7 @@ class Transcoder:
             LogError: the format or a nested one is missing or cannot be laid out.
         """
         self.definition = definition_text(name, formats)
+        self.topic = topic_names(formats)[name]
         self.type_name = type_names(formats)[name]
         self._needed = _measured(name, formats).needed
         pieces, body = _plan(name, formats)
