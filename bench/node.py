@@ -82,7 +82,7 @@ def _copy(name: str, broker: uorb.Broker, seconds: float) -> Row:
     return row(f"publish + check + copy, {name} / raw Zenoh", measured, GOAL_COPY)
 
 
-def _zenoh() -> tuple[Timed, Callable[[], object]]:
+def _zenoh() -> tuple[Timed, Callable[[], None]]:
     import zenoh
 
     config = zenoh.Config()
@@ -100,7 +100,7 @@ def _zenoh() -> tuple[Timed, Callable[[], object]]:
             put(encode(sample(number), 0))
             decode(receive().payload.to_bytes(), 0)
 
-    return timed(loop), lambda: session.close()  # type: ignore[no-untyped-call]
+    return timed(loop), session.close
 
 
 if __name__ == "__main__":
