@@ -204,8 +204,7 @@ def samples(kind: type[messages.Message]) -> list[Any]:
         for member in info.schema.members:
             fractional = member.type == "float32"
             drawn = [
-                random.uniform(-9, 9) if fractional else random.randrange(1, 100)
-                for _ in range(member.length or 1)
+                random.uniform(-9, 9) if fractional else random.randrange(1, 100) for _ in range(member.length or 1)
             ]
             values[member.name] = tuple(drawn) if member.length else drawn[0]
         made.append(info.decode(info.encode(kind(**values), 0), 0))
@@ -215,9 +214,7 @@ def samples(kind: type[messages.Message]) -> list[Any]:
 def converted(batch: Sequence[Any], target: Callable[..., Any], sequence: type = tuple) -> list[Any]:
     """Return the batch as another class."""
     return [
-        target(
-            **{k: sequence(v) if isinstance(v, tuple) else v for k, v in msgspec.structs.asdict(m).items()}
-        )
+        target(**{k: sequence(v) if isinstance(v, tuple) else v for k, v in msgspec.structs.asdict(m).items()})
         for m in batch
     ]
 
@@ -272,9 +269,7 @@ def _hand_written(
     assert [decode(data) for data in encoded] == twins
     return [
         _row(f"encode {name} / hand-written", over_pair(batch, info.encode), over(twins, encode), seconds),
-        _row(
-            f"decode {name} / hand-written", over_pair(encoded, info.decode), over(encoded, decode), seconds
-        ),
+        _row(f"decode {name} / hand-written", over_pair(encoded, info.decode), over(encoded, decode), seconds),
     ]
 
 

@@ -31,9 +31,7 @@ def _measure(name: str, near: int, far: int, seconds: float) -> Row:
 
             def over_pipe(n: int) -> float:
                 child.serve("pipe", n)
-                return exchange(
-                    lambda data: os.write(child.write_fd, data), lambda: os.read(child.read_fd, SIZE), n
-                )
+                return exchange(lambda data: os.write(child.write_fd, data), lambda: os.read(child.read_fd, SIZE), n)
 
             n = max(50, int(200 * seconds))
             measured = alternate(over_bus, over_pipe, ROUNDS, n)
@@ -49,9 +47,7 @@ def _child(cpu: int, read_fd: int, write_fd: int) -> None:
         serve(
             {
                 "bus": bus.answer,
-                "pipe": lambda n: answer(
-                    lambda data: os.write(write_fd, data), lambda: os.read(read_fd, SIZE), n
-                ),
+                "pipe": lambda n: answer(lambda data: os.write(write_fd, data), lambda: os.read(read_fd, SIZE), n),
             }
         )
 

@@ -102,7 +102,6 @@ def print_table(rows: Iterable[Row]) -> None:
     widths = [max(map(len, column)) for column in zip(*cells)]
     for cell in cells:
         texts = (
-            text.rjust(width) if 0 < i < 6 else text.ljust(width)
-            for i, (text, width) in enumerate(zip(cell, widths))
+            text.rjust(width) if 0 < i < 6 else text.ljust(width) for i, (text, width) in enumerate(zip(cell, widths))
         )
         print("  ".join(texts).rstrip())

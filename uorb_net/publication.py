@@ -83,9 +83,7 @@ class Publication(Generic[M]):
         """Accept the same type loaded another way (from a peer's text), refuse all others."""
         kind: MessageType | None = getattr(type(message), "__uorb__", None)
         if kind is None or kind.type_hash != self._node.type.type_hash:
-            raise TopicMismatchError(
-                f"{self.topic} takes {self._class.__name__}, not {type(message).__name__}"
-            )
+            raise TopicMismatchError(f"{self.topic} takes {self._class.__name__}, not {type(message).__name__}")
         return cast(M, message)
 
     def unadvertise(self) -> None:

@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 CROWDED = 0.005  # seconds between looks where a node's sleeper table is full
 
 
-def poll(
-    subscriptions: "Sequence[Subscription[Any]]", timeout: float | None = None
-) -> "list[Subscription[Any]]":
+def poll(subscriptions: "Sequence[Subscription[Any]]", timeout: float | None = None) -> "list[Subscription[Any]]":
     """Return those of `subscriptions` that have an update, in their order; wait for the first.
 
     Args:
@@ -47,9 +45,7 @@ def ready(subscriptions: "Sequence[Subscription[Any]]") -> "list[Subscription[An
     return found if len(found) < 2 else list(dict.fromkeys(found))
 
 
-def wait_for(
-    subscriptions: "Sequence[Subscription[Any]]", timeout: float | None
-) -> "list[Subscription[Any]]":
+def wait_for(subscriptions: "Sequence[Subscription[Any]]", timeout: float | None) -> "list[Subscription[Any]]":
     """Sleep until one is ready; the caller has looked already and found none."""
     if timeout is not None and timeout <= 0:
         return []

@@ -124,9 +124,7 @@ def test_own_instances_keep_their_number_or_take_the_lowest_free(vehicle: Any, e
     autopilot, _ = vehicle.host("autopilot")
     companion, _ = vehicle.host("companion")
     local = companion.advertise_multi(VehicleAttitude, attitude(7))
-    remote = [
-        autopilot.advertise_multi(VehicleAttitude, attitude(number), priority=100) for number in range(2)
-    ]
+    remote = [autopilot.advertise_multi(VehicleAttitude, attitude(number), priority=100) for number in range(2)]
     assert [local.instance, *(p.instance for p in remote)] == [0, 0, 1]
     assert eventually(lambda: companion.group_count("vehicle_attitude") == 3)
     assert {s.instance: s.origin for s in companion.topics()}[0] == "companion"
@@ -139,9 +137,7 @@ def test_own_instances_keep_their_number_or_take_the_lowest_free(vehicle: Any, e
     assert found == {0, 1}
 
 
-def test_interval_is_applied_at_the_sender_and_the_last_sample_arrives(
-    vehicle: Any, eventually: Until
-) -> None:
+def test_interval_is_applied_at_the_sender_and_the_last_sample_arrives(vehicle: Any, eventually: Until) -> None:
     """A slow subscriber costs few transfers; what was held back is no loss; the burst's end comes."""
     autopilot, sender = vehicle.host("autopilot")
     companion, link = vehicle.host("companion")
@@ -182,9 +178,7 @@ def test_unadvertise_and_readvertise_cross(vehicle: Any, eventually: Until) -> N
     assert subscription.copy() == attitude(2)
 
 
-def test_a_peer_that_stops_takes_its_topics_along_and_brings_them_back(
-    vehicle: Any, eventually: Until
-) -> None:
+def test_a_peer_that_stops_takes_its_topics_along_and_brings_them_back(vehicle: Any, eventually: Until) -> None:
     """Stop and start again under the same name: the other host follows by itself."""
     autopilot, link = vehicle.host("autopilot")
     companion, other = vehicle.host("companion")

@@ -48,9 +48,7 @@ class Broker:
         """
         name = vehicle or os.environ.get("UORB_VEHICLE") or "default"
         if name.startswith(".") or not all(c.isalnum() or c in "_-." for c in name) or len(name) > 64:
-            raise ValueError(
-                f"vehicle = {name!r}: letters, digits, _ . - only, at most 64, not starting with a dot"
-            )
+            raise ValueError(f"vehicle = {name!r}: letters, digits, _ . - only, at most 64, not starting with a dot")
         self.vehicle = name
         self._open(process_directory(name))
 
@@ -326,9 +324,7 @@ class Broker:
 
     def _alive(self) -> None:
         if self._closed:
-            raise ClosedError(
-                "broker is closed, or belongs to the parent of this forked process: make a new Broker"
-            )
+            raise ClosedError("broker is closed, or belongs to the parent of this forked process: make a new Broker")
 
     def __enter__(self) -> "Broker":
         return self

@@ -32,9 +32,7 @@ if TYPE_CHECKING:
 INSTANCES = 10
 
 
-def open_node(
-    directory: Directory, type_: "MessageType", topic: str, instance: int, queue_length: int
-) -> Node:
+def open_node(directory: Directory, type_: "MessageType", topic: str, instance: int, queue_length: int) -> Node:
     """Return this process's `Node`, made on the bus if it is not there (under the directory lock).
 
     Raises:

@@ -70,9 +70,7 @@ def checked_folder(path: str, forbidden: int) -> None:
     if not stat.S_ISDIR(found.st_mode):
         raise BusError(errno.ENOTDIR, f"{path} is a link or a file, not a folder of this user: remove it")
     if found.st_uid != os.getuid():
-        raise BusError(
-            errno.EPERM, f"{path} belongs to user {found.st_uid}: set UORB_RUNTIME_DIR to a folder of yours"
-        )
+        raise BusError(errno.EPERM, f"{path} belongs to user {found.st_uid}: set UORB_RUNTIME_DIR to a folder of yours")
     if found.st_mode & forbidden:
         mode = stat.S_IMODE(found.st_mode)
         raise BusError(errno.EPERM, f"{path} is open to others (mode {mode:04o}): chmod 700 it, or remove it")

@@ -48,9 +48,7 @@ def shares(words: "memoryview[int]") -> Iterator[Share]:
         process = words[index]
         if process:
             word = words[index + 1]
-            yield Share(
-                index, process, word & 0xFFFF, word >> 16 & 0xFF, word >> 24 & 0xFFFF, bool(word >> 40 & 1)
-            )
+            yield Share(index, process, word & 0xFFFF, word >> 16 & 0xFF, word >> 24 & 0xFFFF, bool(word >> 40 & 1))
 
 
 def add_share(words: "memoryview[int]", name: str, share: Share) -> None:
@@ -64,9 +62,7 @@ def add_share(words: "memoryview[int]", name: str, share: Share) -> None:
             words[index + 1] = share.pack()
             words[index] = share.process
             return
-    raise BusError(
-        ENOSPC, f"{name}: {PUBLISHERS_MAX} processes publish already, which is the most a node takes"
-    )
+    raise BusError(ENOSPC, f"{name}: {PUBLISHERS_MAX} processes publish already, which is the most a node takes")
 
 
 def drop_share(words: "memoryview[int]", process: int, origin: int) -> None:
@@ -127,9 +123,7 @@ def claim_subscriber(words: "memoryview[int]", name: str, process: int) -> int:
         if not words[index] and not free:
             free = index
     if not free:
-        raise BusError(
-            ENOSPC, f"{name}: {SUBSCRIBERS_MAX} processes subscribe already, which is the most a node takes"
-        )
+        raise BusError(ENOSPC, f"{name}: {SUBSCRIBERS_MAX} processes subscribe already, which is the most a node takes")
     words[free + 1] = 0
     words[free + 2] = NO_INTERVAL
     words[free + 3] = 0

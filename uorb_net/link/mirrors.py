@@ -164,13 +164,14 @@ class Mirrors:
         known = self._types.get(advert.type_hash)
         if known is not None:
             return known
-        try:
-            own = messages.type_for_topic(advert.topic)
-        except UorbError:
-            own = None
-        if own is not None and own.__uorb__.type_hash == advert.type_hash:
-            self._types[advert.type_hash] = own
-            return own
+        if advert.type_hash not in self._asked:  # searching for what is not installed takes milliseconds
+            try:
+                own = messages.type_for_topic(advert.topic)
+            except UorbError:
+                own = None
+            if own is not None and own.__uorb__.type_hash == advert.type_hash:
+                self._types[advert.type_hash] = own
+                return own
         now = monotonic()
         if now - self._asked.get(advert.type_hash, -ASK_EVERY) >= ASK_EVERY:
             self._asked[advert.type_hash] = now

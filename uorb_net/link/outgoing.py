@@ -58,9 +58,7 @@ class LocalNode:
     def look(self, directory: Directory) -> None:
         """Read who subscribes here, and how fast the fastest wants it."""
         words = self.mapping.words
-        living = [
-            i for i in subscriber_entries(words) if words[i + 1] & 0xFFFFFFFF and directory.alive(words[i])
-        ]
+        living = [i for i in subscriber_entries(words) if words[i + 1] & 0xFFFFFFFF and directory.alive(words[i])]
         self.subscribers = len(living)
         self.interval_us = min((words[index + 2] for index in living), default=0)
 
