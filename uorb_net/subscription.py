@@ -1,6 +1,6 @@
 """One reader of a node: its position, its interval, what it lost; copy, check, update, wait.
 
-The arithmetic is docs/semantics.md, "Generations": a position is the number of the next write to
+The arithmetic is docs/node.md, "Reading": a position is the number of the next write to
 read; generations are 62 bits wide and never wrap (at a million samples a second: 146,000 years).
 """
 

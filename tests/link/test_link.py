@@ -288,7 +288,7 @@ def test_one_link_per_bus_and_kind_of_channel() -> None:
     network = MemoryNetwork()
     with uorb.Broker.private() as broker:
         first = uorb.Link(broker, network.channel(), host="a").start()
-        with pytest.raises(uorb.LinkError, match="in process [0-9]+"):
+        with pytest.raises(uorb.LinkError, match=r"in process [0-9]+"):
             uorb.Link(broker, network.channel(), host="b").start()
         first.stop()
         uorb.Link(broker, network.channel(), host="b").start().stop()
