@@ -44,9 +44,9 @@ class Vehicle:
         *others, own = [f"tcp/127.0.0.1:{port}" for port in self.ports]
         return ZenohChannel(listen=[own], connect=others)
 
-    def host(self, name: str) -> tuple[uorb.Broker, uorb.Link]:
-        """Start a host and wait until all hosts see each other."""
-        broker = uorb.Broker.private()
+    def host(self, name: str, broker: uorb.Broker | None = None) -> tuple[uorb.Broker, uorb.Link]:
+        """Start a host, on a given bus or a fresh one, and wait until all hosts see each other."""
+        broker = broker or uorb.Broker.private()
         link = uorb.Link(broker, self.channel(), host=name)
         link.start()
         for other in self.links:

@@ -121,11 +121,12 @@ def test_shared_instance_merges_hosts_without_echo(vehicle: Any, eventually: Unt
 
 def test_own_instances_keep_their_number_or_take_the_lowest_free(vehicle: Any, eventually: Until) -> None:
     """Instances of two hosts never merge."""
-    autopilot, _ = vehicle.host("autopilot")
-    companion, _ = vehicle.host("companion")
-    local = companion.advertise_multi(VehicleAttitude, attitude(7))
-    remote = [autopilot.advertise_multi(VehicleAttitude, attitude(number), priority=100) for number in range(2)]
-    assert [local.instance, *(p.instance for p in remote)] == [0, 0, 1]
+    autopilot, companion = uorb.Broker.private(), uorb.Broker.private()
+    companion.advertise_multi(VehicleAttitude, attitude(7))
+    for number in range(2):
+        autopilot.advertise_multi(VehicleAttitude, attitude(number), priority=100)
+    vehicle.host("autopilot", autopilot)
+    vehicle.host("companion", companion)
     assert eventually(lambda: companion.group_count("vehicle_attitude") == 3)
     assert {s.instance: s.origin for s in companion.topics()}[0] == "companion"
     found = set()
