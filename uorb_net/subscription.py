@@ -13,7 +13,7 @@ from .broker.layout import FLAG_LATCHED, GENERATION, MOVED, UNADVERTISED, W_FLOO
 from .broker.slots import Sample as Slot
 from .broker.slots import decoded, read
 from .errors import ClosedError, NoDataError
-from .waiting import wait_for
+from .waiting import wait_for_one
 
 if TYPE_CHECKING:
     from .broker.node import Node
@@ -274,7 +274,7 @@ class Subscription(Generic[M]):
 
     def wait(self, timeout: float | None = None) -> bool:
         """Block until `check()` is true, at most `timeout` seconds (None: without limit)."""
-        return self.check() or bool(wait_for([self], timeout))
+        return self.check() or wait_for_one(self, timeout)
 
     def due_in(self) -> float | None:
         """Return the seconds until a sample held back by the interval is due; None if none is held."""

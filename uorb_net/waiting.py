@@ -57,6 +57,39 @@ def wait_for(subscriptions: "Sequence[Subscription[Any]]", timeout: float | None
         give_back(sleeper)
 
 
+def wait_for_one(subscription: "Subscription[Any]", timeout: float | None) -> bool:
+    """Do what `wait_for` does for the commonest case, without lists: a round trip is made of this."""
+    if timeout is not None and timeout <= 0:
+        return False
+    deadline = 0.0 if timeout is None else monotonic() + timeout
+    sleeper = take()
+    look = 0
+    try:
+        directory = subscription._node.directory
+        number = sleeper.end(directory).number
+        while True:
+            armed = directory.arm(subscription._node.mapping.words, number)
+            if subscription.check():
+                return True
+            seconds = LOOKS[look] if armed else CROWDED
+            due = subscription.due_in()
+            if due is not None and due < seconds:
+                seconds = due
+            if deadline:
+                left = deadline - monotonic()
+                if left <= 0:
+                    return False
+                seconds = min(seconds, left)
+            if sleeper.sleep(seconds):
+                look = 0
+            elif look < len(LOOKS) - 1:
+                look += 1
+            if subscription.check():
+                return True
+    finally:
+        give_back(sleeper)
+
+
 def _sleep(
     subscriptions: "Sequence[Subscription[Any]]", sleeper: Sleeper, deadline: float | None
 ) -> "list[Subscription[Any]]":

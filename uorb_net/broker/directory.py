@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 from threading import RLock
 from typing import TYPE_CHECKING
 
-from .layout import MAGIC, W_G, W_HINT, W_MAGIC, Label, Shape, format_node
+from .layout import MAGIC, SLEEPERS, W_G, W_HINT, W_MAGIC, W_SLEEPERS, Label, Shape, format_node
 from .mapping import Mapping
 from .tables import claim_sleeper, sleeper_entries
 from .waking import End, forget_directory, poke
@@ -45,6 +45,7 @@ class Directory(ABC):
 
     def __init__(self) -> None:
         self.nodes: dict[tuple[str, int], Node] = {}
+        self.fds: dict[int, int] = {}  # by FIFO number: a descriptor to write to, own and others'
         self.closed = False
 
     @abstractmethod
@@ -80,12 +81,12 @@ class Directory(ABC):
         """List the numbers of this process's FIFOs."""
 
     @abstractmethod
-    def end_of(self, number: int) -> int | None:
-        """Return a descriptor that writes to FIFO `number`; None if its owner is gone."""
+    def open_end(self, number: int) -> bool:
+        """Put a descriptor for another process's FIFO into `fds`; False if its owner is gone."""
 
     @abstractmethod
     def forget_end(self, number: int) -> None:
-        """Drop what is kept for FIFO `number`: its owner is dead."""
+        """Drop the descriptor kept for another process's FIFO."""
 
     @abstractmethod
     def lock_file(self, topic: str, instance: int, mapping: Mapping) -> int | None:
@@ -108,29 +109,30 @@ class Directory(ABC):
 
     def poke(self, number: int) -> None:
         """Wake the sleeper with FIFO `number`."""
-        fd = self.end_of(number)
-        if fd is not None and not poke(fd):
+        if (number in self.fds or self.open_end(number)) and not poke(self.fds[number]):
             self.forget_end(number)
 
     def dead_end(self, number: int) -> bool:
         """Tell whether FIFO `number` has no owner any more."""
         self.forget_end(number)
-        return self.end_of(number) is None
+        return number not in self.fds and not self.open_end(number)
 
     def arm(self, words: "memoryview[int]", number: int) -> bool:
         """Announce sleeper `number` in a node's table; False where the table is full of the living."""
-        for index in sleeper_entries(words):
-            if words[index] == number:
-                break
-        else:
-            with self.hold():
-                claimed = claim_sleeper(words, number, self.dead_end)
-            if claimed is None:
-                return False
-            index = claimed
+        index = SLEEPERS
+        if words[index] != number and not (index := self._entry(words, number)):
+            return False
         words[index + 1] = 1
         words[W_HINT] = 1  # after `armed`: see docs/node.md, "Races"
         return True
+
+    def _entry(self, words: "memoryview[int]", number: int) -> int:
+        """Return the index of a sleeper's entry, claimed if need be; 0 where the table is full."""
+        for index in sleeper_entries(words):
+            if words[index] == number:
+                return index
+        with self.hold():
+            return claim_sleeper(words, number, self.dead_end) or 0
 
     def announce(self) -> None:
         """Step the bulletin (under the directory lock): something appeared, went or changed."""
@@ -150,12 +152,19 @@ class Directory(ABC):
 
 
 def wake(directory: Directory, words: "memoryview[int]") -> None:
-    """Wake every armed sleeper of a table. No lock: see docs/node.md, "Wake"."""
+    """Wake every armed sleeper of a table. No lock: see docs/node.md, "Sleeping"."""
     words[W_HINT] = 0
-    for index in sleeper_entries(words):
+    fds = directory.fds
+    for index in range(SLEEPERS, SLEEPERS + 2 * words[W_SLEEPERS], 2):
         if words[index + 1]:
             words[index + 1] = 0
-            directory.poke(words[index])
+            number = words[index]
+            try:
+                os.write(fds[number], b"\0")
+            except BlockingIOError:
+                continue  # full: its owner is awake
+            except (KeyError, OSError):
+                directory.poke(number)  # not known yet, or dead
 
 
 class PrivateDirectory(Directory):
@@ -206,14 +215,14 @@ class PrivateDirectory(Directory):
             self._count += 1
             fd, write_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
             end = self._ends[self._count] = End(self._count, fd, write_fd)
+            self.fds[end.number] = write_fd
             return end
 
     def own_ends(self) -> list[int]:
         return list(self._ends)
 
-    def end_of(self, number: int) -> int | None:
-        end = self._ends.get(number)
-        return None if end is None else end.write_fd
+    def open_end(self, number: int) -> bool:
+        return False
 
     def forget_end(self, number: int) -> None:
         return  # own sleepers live as long as this process; `close` drops them
@@ -229,3 +238,4 @@ class PrivateDirectory(Directory):
         for end in self._ends.values():
             end.close()
         self._ends.clear()
+        self.fds.clear()

@@ -86,7 +86,6 @@ class SharedDirectory(Directory):
         checked_folder(self.path, 0o077)
         self._threads = RLock()
         self._depth = 0
-        self._writers: dict[int, int] = {}
         self._ends: dict[int, End] = {}
         self._lock_fd = self._open(".lock")
         self._alive_fd = self._open(".alive")
@@ -313,34 +312,32 @@ class SharedDirectory(Directory):
             except OSError as error:
                 raise BusError(error.errno or errno.EIO, f"{path}: {error.strerror}") from error
             end = self._ends[number] = End(number, fd, fd, path)
+            self.fds[number] = fd
             return end
 
     def own_ends(self) -> list[int]:
         return list(self._ends)
 
-    def end_of(self, number: int) -> int | None:
-        end = self._ends.get(number)
-        if end is not None:
-            return end.fd
-        fd = self._writers.get(number)
-        if fd is not None:
-            return fd
+    def open_end(self, number: int) -> bool:
         path = os.path.join(self.path, f".w{number}")
         try:
             fd = more_descriptors(lambda: os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_CLOEXEC))
         except OSError:
-            return None
-        if len(self._writers) >= KEPT_ENDS:
+            return False
+        if len(self.fds) >= KEPT_ENDS:
             self._prune()
-        return self._writers.setdefault(number, fd)
+        if self.fds.setdefault(number, fd) != fd:
+            os.close(fd)  # another thread was faster
+        return True
 
     def forget_end(self, number: int) -> None:
-        fd = self._writers.pop(number, None)
-        if fd is not None:
-            os.close(fd)
+        if number not in self._ends:
+            fd = self.fds.pop(number, None)
+            if fd is not None:
+                os.close(fd)
 
     def _prune(self) -> None:
-        for number, fd in list(self._writers.items()):
+        for number, fd in list(self.fds.items()):
             if not os.fstat(fd).st_nlink:
                 self.forget_end(number)
 
@@ -350,16 +347,17 @@ class SharedDirectory(Directory):
         if self.closed:
             return
         super().close()
+        self._close_descriptors()
         for end in self._ends.values():
             end.close()
         self._ends.clear()
-        self._close_descriptors()
 
     def _close_descriptors(self) -> None:
-        for fd in [self._lock_fd, self._alive_fd, *self._writers.values()]:
+        others = [fd for number, fd in self.fds.items() if number not in self._ends]
+        for fd in [self._lock_fd, self._alive_fd, *others]:
             os.close(fd)
         self._lock_fd = self._alive_fd = -1
-        self._writers.clear()
+        self.fds.clear()
 
     def abandon(self) -> None:
         super().abandon()
