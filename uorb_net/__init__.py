@@ -11,6 +11,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from . import messages as messages
     from . import msg as msg
+    from . import orb as orb
     from .broker import ORB_QUEUE_LENGTH_MAX as ORB_QUEUE_LENGTH_MAX
     from .broker import Broker as Broker
     from .broker import Priority as Priority
@@ -56,7 +57,7 @@ _HOMES = {
     ],
 }  # fmt: skip
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
-_MODULES = ("messages", "msg")
+_MODULES = ("messages", "msg", "orb")
 __all__ = ["__version__", *_MODULES, *_HOME]  # noqa: PLE0604 - names load through __getattr__
 
 

@@ -17,6 +17,7 @@ from .waiting import wait_for_one
 
 if TYPE_CHECKING:
     from .broker.node import Node
+    from .exported import Exported
     from .messages import Message, MessageType
 
 M = TypeVar("M", bound="Message")
@@ -60,8 +61,8 @@ class Subscription(Generic[M]):
     """A reader of one topic instance. Made by `Broker.subscribe`; lives until closed."""
 
     __slots__ = (
-        "_closed", "_closed_by", "_decode", "_interval", "_last", "_lost", "_mapping", "_node", "_position",
-        "_quiet", "_words", "queue_size",
+        "_closed", "_closed_by", "_decode", "_exported", "_interval", "_last", "_lost", "_mapping", "_node",
+        "_position", "_quiet", "_words", "queue_size",
     )  # fmt: skip
 
     def __init__(
@@ -74,6 +75,7 @@ class Subscription(Generic[M]):
         self._lost = 0
         self._closed = False
         self._closed_by = on_close
+        self._exported: Exported | None = None
         self.queue_size = 0
         self._words: memoryview[int] = node.mapping.words
         self._follow()
@@ -98,6 +100,11 @@ class Subscription(Generic[M]):
     def topic(self) -> str:
         """The topic's name."""
         return self._node.label.topic
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed, with its broker, or belongs to the parent of a fork."""
+        return self._closed
 
     @property
     def instance(self) -> int:
@@ -158,6 +165,8 @@ class Subscription(Generic[M]):
         self._quiet = -1
         members.enlist(self._node, self)
         self._node.poke_own()
+        if self._exported is not None:
+            self._exported.settle()
 
     @property
     def interval_us(self) -> int:
@@ -249,6 +258,8 @@ class Subscription(Generic[M]):
                 self._count_lost(number, passed)
         interval = self._interval
         self._last = min(max(self._last + interval, now - interval), now) if interval else now
+        if self._exported is not None:
+            self._exported.settle()
 
     def _count_lost(self, number: int, passed: int) -> None:
         passed = min(passed, number - self._words[W_FLOOR])  # an earlier advertisement's are not lost
@@ -292,6 +303,33 @@ class Subscription(Generic[M]):
             if message is not None:
                 yield message
 
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while an update is pending, for select, selectors, asyncio.
+
+        It may be readable once too often, so `update` after it, and up to 1 s late after a publisher
+        was killed in the act. It belongs to the subscription and is closed with it.
+        """
+        self._words[W_G]
+        if self._exported is None:
+            from .exported import Exported
+
+            self._exported = Exported(self)
+        return self._exported.end.fd
+
+    async def next(self, timeout: float | None = None) -> M | None:
+        """Return the next unread sample, waiting for it in the running event loop; None on timeout."""
+        from .awaiting import next_message
+
+        return await next_message(self, timeout)
+
+    def __aiter__(self) -> "Subscription[M]":
+        return self
+
+    async def __anext__(self) -> M:
+        message = await self.next()
+        assert message is not None  # it has no timeout
+        return message
+
     # -- the node ----------------------------------------------------------------------------------
 
     def _current(self) -> int:
@@ -326,6 +364,8 @@ class Subscription(Generic[M]):
         if self._closed:
             return
         self.spend()
+        if self._exported is not None:
+            self._exported.close()
         members.unsubscribe(self._node, self)
         self._closed_by(self)
         self._node.poke_own()

@@ -67,6 +67,11 @@ class Broker:
         return broker
 
     @property
+    def closed(self) -> bool:
+        """Whether it was closed, or belongs to the parent of a fork."""
+        return self._closed
+
+    @property
     def path(self) -> str:
         """The folder of the bus; "(private)" for one in memory."""
         return self._directory.path
@@ -159,7 +164,7 @@ class Broker:
         self, topic: Any, instance: int | None, data: Any, priority: int, queue_length: int | None
     ) -> "Publication[Any]":
         self._alive()
-        name, type_ = self._resolve(topic, instance or 0)
+        name, type_ = self.resolve(topic, instance or 0)
         publication = self._join(type_.__uorb__, name, instance, int(priority), queue_length)
         if data is not None:
             try:
@@ -246,7 +251,7 @@ class Broker:
         if definition not in ("own", "publisher"):
             raise ValueError(f"definition = {definition!r}: own or publisher")
         found = self._published(topic, instance) if definition == "publisher" else None
-        name, type_ = found or self._resolve(topic, instance)
+        name, type_ = found or self.resolve(topic, instance)
         node = members.subscribe(self._directory, type_.__uorb__, name, instance)
         subscription: Subscription[Any] = Subscription(node, start, interval, self._users.discard)
         self._users.add(subscription)
@@ -257,7 +262,7 @@ class Broker:
     def exists(self, topic: Any, instance: int = 0) -> bool:
         """Tell whether someone, here or on another host, advertises the instance."""
         self._alive()
-        name, _ = self._resolve(topic, 0)
+        name, _ = self.resolve(topic, 0)
         if not 0 <= instance < members.INSTANCES:
             return False
         mapping = self._directory.find(name, instance, populate=False)
@@ -272,8 +277,12 @@ class Broker:
         self._alive()
         return [node.status for node in survey(self._directory)]
 
-    def _resolve(self, topic: Any, instance: int) -> tuple[str, "type[Message]"]:
-        """Return a topic argument's name and type; the bus is asked where no definition is installed."""
+    def resolve(self, topic: Any, instance: int = 0) -> tuple[str, "type[Message]"]:
+        """Return a topic argument's name and type; the bus is asked where no definition is installed.
+
+        Raises:
+            UnknownTopicError: neither a definition installed here nor a node of that name.
+        """
         from .. import messages
 
         if isinstance(topic, type) and issubclass(topic, messages.Message):

@@ -46,6 +46,7 @@ class Directory(ABC):
     def __init__(self) -> None:
         self.nodes: dict[tuple[str, int], Node] = {}
         self.fds: dict[int, int] = {}  # by FIFO number: a descriptor to write to, own and others'
+        self._ends: dict[int, End] = {}  # this process's
         self.closed = False
 
     @abstractmethod
@@ -76,9 +77,15 @@ class Directory(ABC):
     def new_end(self) -> End:
         """Make a FIFO for a sleeper."""
 
-    @abstractmethod
     def own_ends(self) -> list[int]:
         """List the numbers of this process's FIFOs."""
+        return list(self._ends)
+
+    def drop_end(self, end: End) -> None:
+        """Close a FIFO of this process; its table entries are found dead by whoever needs the place."""
+        if self._ends.pop(end.number, None) is not None:
+            self.fds.pop(end.number, None)
+            end.close()
 
     @abstractmethod
     def open_end(self, number: int) -> bool:
@@ -180,7 +187,6 @@ class PrivateDirectory(Directory):
         self.bulletin[W_MAGIC] = MAGIC
         self._lock = RLock()
         self._files: dict[tuple[str, int], Mapping] = {}
-        self._ends: dict[int, End] = {}
         self._count = 0
 
     @contextmanager
@@ -217,9 +223,6 @@ class PrivateDirectory(Directory):
             end = self._ends[self._count] = End(self._count, fd, write_fd)
             self.fds[end.number] = write_fd
             return end
-
-    def own_ends(self) -> list[int]:
-        return list(self._ends)
 
     def open_end(self, number: int) -> bool:
         return False

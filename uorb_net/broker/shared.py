@@ -86,7 +86,6 @@ class SharedDirectory(Directory):
         checked_folder(self.path, 0o077)
         self._threads = RLock()
         self._depth = 0
-        self._ends: dict[int, End] = {}
         self._lock_fd = self._open(".lock")
         self._alive_fd = self._open(".alive")
         self.me = 0
@@ -314,9 +313,6 @@ class SharedDirectory(Directory):
             end = self._ends[number] = End(number, fd, fd, path)
             self.fds[number] = fd
             return end
-
-    def own_ends(self) -> list[int]:
-        return list(self._ends)
 
     def open_end(self, number: int) -> bool:
         path = os.path.join(self.path, f".w{number}")
