@@ -60,9 +60,7 @@ def _parse(what: str, text: object) -> Endpoint:
 def _split(what: str, text: str, protocol: str, address: str) -> tuple[str, int]:
     host, colon, port = address.rpartition(":")
     if address.endswith("]") or not colon:
-        raise ChannelError(
-            f"{what} endpoint {text!r} has no port; write {protocol}/{address}:{_DEFAULT_PORT}"
-        )
+        raise ChannelError(f"{what} endpoint {text!r} has no port; write {protocol}/{address}:{_DEFAULT_PORT}")
     if ":" in host and not (host.startswith("[") and host.endswith("]")):
         raise ChannelError(
             f"{what} endpoint {text!r}: write an IPv6 address in brackets, with its port: "

@@ -355,6 +355,7 @@ class MemoryNetwork:
                 self._changed.wait(pause)
             self._events.clear()
             self._thread = None
+            self._changed.notify_all()
             return False
 
 

@@ -235,9 +235,7 @@ class NodeChannel(Channel):
         before = self._node
         if before is not None and not before.stopping.is_set():
             raise ChannelError("the channel has been started already")
-        self._node = node = self._make_node(
-            vehicle, Peer(host, self._draw_id()), self._handler, self._counters
-        )
+        self._node = node = self._make_node(vehicle, Peer(host, self._draw_id()), self._handler, self._counters)
         try:
             node.open()
         except BaseException:
@@ -270,9 +268,7 @@ class NodeChannel(Channel):
         if (node := self._running()) is not None:
             node.unsubscribe(peer, (topic, instance))
 
-    def send_message(
-        self, peer: Peer, topic: str, instance: int, header: SampleHeader, payload: bytes
-    ) -> None:
+    def send_message(self, peer: Peer, topic: str, instance: int, header: SampleHeader, payload: bytes) -> None:
         if (node := self._running()) is not None:
             node.queue_sample(peer, (topic, instance), header, payload)
 

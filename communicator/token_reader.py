@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 RING = 65_536  # events that may wait; Zenoh takes the memory as they come
 MAX_TOKENS = 65_536  # of one kind, of all hosts together
 _ASK_TIMEOUT = 2.0
+_ANSWERS = 4096
 _ASK_AGAIN = 1.0
 
 
@@ -95,8 +96,10 @@ class TokenReader:
     def _ask(self) -> set[str]:
         import zenoh
 
-        ring: zenoh.handlers.RingChannel[zenoh.Reply] = zenoh.handlers.RingChannel(2 * MAX_TOKENS)
-        replies = self._session.liveliness().get(self._filter, ring, timeout=_ASK_TIMEOUT)
+        # A FIFO, though a full one stalls the link: a ring loses its content with the last reply, and
+        # nothing but this loop reads between the first and that.
+        fifo: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(_ANSWERS)
+        replies = self._session.liveliness().get(self._filter, fifo, timeout=_ASK_TIMEOUT)
         listed, complete = set[str](), True
         for reply in replies:
             if reply.ok is not None:

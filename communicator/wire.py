@@ -60,9 +60,7 @@ def pack_sample_header(stream: int, header: SampleHeader, length: int) -> bytes:
     """
     flags = _LATCHED if header.latched else 0
     try:
-        return _SAMPLE.pack(
-            _KIND_SAMPLE, flags, stream, length, header.sequence, header.published_us, header.withheld
-        )
+        return _SAMPLE.pack(_KIND_SAMPLE, flags, stream, length, header.sequence, header.published_us, header.withheld)
     except StructError as error:
         raise ValueError(f"sample header out of range: {header}") from error
 

@@ -1,5 +1,6 @@
 """The channel between hosts: PX4's verbs over Eclipse Zenoh. docs/wire.md has the wire."""
 
+import atexit
 import os
 from collections.abc import Iterable, Mapping
 from weakref import WeakSet
@@ -8,10 +9,10 @@ from communicator.channel import ChannelError, ChannelHandler, Peer
 from communicator.counters import Counters
 from communicator.node import Node, NodeChannel
 from communicator.session import check_options
-from communicator.zenoh_node import ZenohNode
+from communicator.zenoh_node import ZenohNode, open_nodes
 
 _channels: "WeakSet[ZenohChannel]" = WeakSet()
-_orphans: list[Node | None] = []
+_orphans: list[ZenohNode] = []
 
 
 class ZenohChannel(NodeChannel):
@@ -87,11 +88,18 @@ class ZenohChannel(NodeChannel):
 
 
 def _mark_forked() -> None:
+    # Never let the child collect a session: closing it would wait for threads it has not got.
+    _orphans.extend(open_nodes)
+    open_nodes.clear()
     for channel in _channels:
         channel._forked = True
-        # Never let the child collect a session: closing it would wait for threads it has not got.
-        _orphans.append(channel._node)
-        channel._node = None
 
 
+def _close_all() -> None:
+    # A daemon thread inside Zenoh that wakes while the interpreter is torn down aborts the process.
+    for node in list(open_nodes):
+        node.close()
+
+
+atexit.register(_close_all)
 os.register_at_fork(after_in_child=_mark_forked)

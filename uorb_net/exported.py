@@ -32,10 +32,12 @@ class Exported:
         subscription = self._subscription
         if not subscription.check():
             self.end.drain()
-            if subscription.due_in() is not None:
-                _timekeeper.hurry()  # armed now, it would be readable before the interval has passed
+            words = subscription._node.mapping.words
+            if subscription.rest():  # armed now, it would be readable before the interval has passed
+                self._directory.disarm(words, self.end.number)
+                _timekeeper.hurry()
                 return
-            self._directory.arm(subscription._node.mapping.words, self.end.number)
+            self._directory.arm(words, self.end.number)
             if not subscription.check():
                 return
         self.end.drain()
@@ -44,10 +46,9 @@ class Exported:
     def due_in(self) -> float:
         """Return the seconds until the timekeeper must look here."""
         try:
-            due = self._subscription.due_in()
+            return min(self._subscription.rest() or LOOK, LOOK)
         except ClosedError:
             return 0.0
-        return LOOK if due is None else min(due, LOOK)
 
     def close(self) -> None:
         """Give the descriptor up."""

@@ -287,6 +287,10 @@ class Subscription(Generic[M]):
         """Block until `check()` is true, at most `timeout` seconds (None: without limit)."""
         return self.check() or wait_for_one(self, timeout)
 
+    def rest(self) -> float:
+        """Return the seconds until the interval has passed; 0 if it has, or there is none."""
+        return max(self._last + self._interval - monotonic(), 0.0) if self._interval else 0.0
+
     def due_in(self) -> float | None:
         """Return the seconds until a sample held back by the interval is due; None if none is held."""
         if not self._interval:
@@ -294,7 +298,7 @@ class Subscription(Generic[M]):
         word = self._words[W_G]
         if word >> 62 or word <= max(self._position, self._words[W_FLOOR]):
             return None
-        return max(self._last + self._interval - monotonic(), 0.0)
+        return self.rest()
 
     def __iter__(self) -> Iterator[M]:
         while True:

@@ -41,9 +41,7 @@ def message() -> Callable[..., bytes]:
 def make_log() -> Callable[..., bytes]:
     """Build a log from messages, each a tuple for ``message`` or bytes put in as they are."""
 
-    def build(
-        *messages: tuple[str, *tuple[object, ...]] | bytes, start_us: int = 1_000_000, version: int = 1
-    ) -> bytes:
+    def build(*messages: tuple[str, *tuple[object, ...]] | bytes, start_us: int = 1_000_000, version: int = 1) -> bytes:
         header = MAGIC + struct.pack("<BQ", version, start_us)
         return header + b"".join(m if isinstance(m, bytes) else _message(*m) for m in messages)
 

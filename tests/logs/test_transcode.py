@@ -15,7 +15,14 @@ from pyulog import ULog
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uorb_net.logs.formats import SIZES, Field, Format, leaves, measure, parse_format
-from uorb_net.logs.transcode import SEPARATOR, Transcoder, definition_text, field_names, type_names
+from uorb_net.logs.transcode import (
+    SEPARATOR,
+    Transcoder,
+    definition_text,
+    field_names,
+    topic_names,
+    type_names,
+)
 from uorb_net.logs.ulog import Data, LogError, ULogReader
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "ulg"
@@ -146,6 +153,7 @@ def test_definition_text() -> None:
         ("a-b/c__d", "ABCD"),
         ("3d_fix", "T3dFix"),
         ("_", "T"),
+        ("none", "TNone"),
     ],
 )
 def test_type_names(name: str, expected: str) -> None:
@@ -156,6 +164,16 @@ def test_type_names(name: str, expected: str) -> None:
 def test_type_names_that_meet_are_kept_apart() -> None:
     """Two formats never share a type."""
     assert type_names(["a_1", "a1", "a__1"]) == {"a_1": "A1", "a1": "A1X2", "a__1": "A1X3"}
+
+
+def test_topic_names() -> None:
+    """A topic is called as in the log, unless that is no name a topic can have."""
+    names = ["a-b", "a_b", "3d_fix", "vehicle/pose", "GpsRaw", "class"]
+    mended = ["a_b_2", "a_b", "f_3d_fix", "vehicle_pose", "GpsRaw", "class"]
+    assert topic_names(names) == dict(zip(names, mended))
+    coder = Transcoder("a-b", formats_of("a-b:uint64_t timestamp;"))
+    assert (coder.topic, coder.type_name) == ("a_b", "AB")
+    assert coder.definition.startswith("# TOPICS a_b\n")
 
 
 @pytest.mark.parametrize(
@@ -201,9 +219,7 @@ def test_padding_is_skipped_and_alignment_inserted() -> None:
     """The log's holes vanish, XCDR1's appear, counted from behind the header."""
     coder = Transcoder(
         "t",
-        formats_of(
-            "t:uint8_t a;uint8_t[3] _padding0;uint64_t timestamp;uint8_t b;uint8_t[1] _padding1;float f;"
-        ),
+        formats_of("t:uint8_t a;uint8_t[3] _padding0;uint64_t timestamp;uint8_t b;uint8_t[1] _padding1;float f;"),
     )
     row = b"\x01" + b"\xee" * 3 + struct.pack("<Q", 99) + b"\x02" + b"\xee" + struct.pack("<f", 0.5)
     assert coder.encode(row) == b"\x00\x01\x00\x00" + struct.pack("<B7xQB3xf", 1, 99, 2, 0.5)

@@ -441,17 +441,13 @@ def test_a_megabyte_of_garbage_is_crossed(tmp_path: Path, make_log: MakeLog) -> 
 def test_unknown_kinds_are_passed_over(tmp_path: Path, make_log: MakeLog, message: MakeLog) -> None:
     """A newer writer's messages are no fault."""
     content, ends = small_log(make_log)
-    log, records = read(
-        write(tmp_path, content[: ends[2]] + message("Z", b"new things") + content[ends[2] :])
-    )
+    log, records = read(write(tmp_path, content[: ends[2]] + message("Z", b"new things") + content[ends[2] :]))
     assert len(timestamps(records)) == 10
     assert (log.faults, log.problem) == (0, "")
 
 
 @pytest.mark.parametrize("size", [2, 5, 14, 19, 200])
-def test_rows_of_wrong_size_are_skipped(
-    tmp_path: Path, make_log: MakeLog, message: MakeLog, size: int
-) -> None:
+def test_rows_of_wrong_size_are_skipped(tmp_path: Path, make_log: MakeLog, message: MakeLog, size: int) -> None:
     """Too short or too long a row is a fault; its neighbours come."""
     content, ends = small_log(make_log)
     path = write(tmp_path, content[: ends[2]] + message("D", 1, bytes(size - 2)) + content[ends[2] :])

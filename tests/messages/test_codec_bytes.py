@@ -68,14 +68,10 @@ def random_element(random: Random, member: Member, nested: dict[str, type[Messag
         number = random.choice([member.primitive.low, member.primitive.high, random.randrange(2)])
         return bool(number) if member.type == "bool" else number
     code = member.primitive.code
-    return struct.unpack(
-        code, struct.pack(code, random.choice([0.0, -1.5, random.gauss(0, 1e6), float("inf")]))
-    )[0]
+    return struct.unpack(code, struct.pack(code, random.choice([0.0, -1.5, random.gauss(0, 1e6), float("inf")])))[0]
 
 
-def plain(
-    message: Message, array: Callable[[Member, list[Any]], Any], make: Callable[[Schema, Any], Any]
-) -> Any:
+def plain(message: Message, array: Callable[[Member, list[Any]], Any], make: Callable[[Schema, Any], Any]) -> Any:
     """Return a message in another library's terms, with text as numbers."""
     values: dict[str, Any] = {}
     for member in message.__uorb__.schema.members:
@@ -117,9 +113,7 @@ def pycdr2_class(schema: Schema) -> Any:
     fields = []
     for member in schema.members:
         kind = pycdr2_class(member.nested) if member.nested else pycdr2_type(member.type)
-        fields.append(
-            (member.name, kind if member.length is None else pycdr2.types.array[kind, member.length])
-        )
+        fields.append((member.name, kind if member.length is None else pycdr2.types.array[kind, member.length]))
     return make_dataclass(schema.name, fields, bases=(pycdr2.IdlStruct,))
 
 

@@ -123,7 +123,5 @@ def test_a_message_with_many_nested_ones_is_decoded_in_order() -> None:
     )
     odd = kind.__uorb__.nested["Odd"]
     random = Random(1)
-    message = kind(
-        odds=[odd(timestamp=random.randrange(256), b=i, c=random.randrange(256)) for i in range(100)]
-    )
+    message = kind(odds=[odd(timestamp=random.randrange(256), b=i, c=random.randrange(256)) for i in range(100)])
     assert messages.decode(kind, messages.encode(message)) == message

@@ -30,8 +30,7 @@ def kind(text: str, name: str = "Sample") -> MessageType:
         (
             "int8 a\nint8 b\nint8 c\nint8 d\n",
             "bool a\nbool b\nbool c\n",
-            "field a: int8 here, bool there; field b: int8 here, bool there; field c: int8 here, bool there"
-            "; ...",
+            "field a: int8 here, bool there; field b: int8 here, bool there; field c: int8 here, bool there; ...",
         ),
         (
             f"Cell[2] cells\n{RULE}\nMSG: px4_msgs/Cell\nfloat32 voltage\n",

@@ -165,9 +165,7 @@ def test_values_of_kindred_kinds_fit(given: dict[str, Any], stored: dict[str, An
 def test_a_stamp_is_set_on_the_slow_way_too() -> None:
     """A message that needs the slow encoder is stamped like any other."""
     message = Sample(flag=np.bool_(True), u8=3)
-    assert Sample.__uorb__.decode(Sample.__uorb__.encode(message, 77), 0) == Sample(
-        timestamp=77, flag=True, u8=3
-    )
+    assert Sample.__uorb__.decode(Sample.__uorb__.encode(message, 77), 0) == Sample(timestamp=77, flag=True, u8=3)
     assert messages.decode(Sample, messages.encode(message)).timestamp == 0
 
 

@@ -173,9 +173,7 @@ def test_pickle_and_copy() -> None:
 
 def test_keyword_and_odd_field_names_work() -> None:
     """A Python keyword is a field reached by ``getattr``; other odd names are ordinary."""
-    cls: Any = Registry(shipped="/nonexistent").from_text(
-        "Odd", "uint8 from\nuint8[2] class\nbool None\nuint8 self\n"
-    )
+    cls: Any = Registry(shipped="/nonexistent").from_text("Odd", "uint8 from\nuint8[2] class\nbool None\nuint8 self\n")
     message = cls(**{"from": 7, "class": [1, 2], "None": True, "self": 4})
     assert getattr(message, "from") == 7
     assert messages.decode(cls, messages.encode(message)) == message

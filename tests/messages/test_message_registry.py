@@ -135,13 +135,9 @@ def test_in_an_earlier_directory_another_message_may_take_a_topic(registry: Regi
 
 def test_an_unknown_name_is_named_with_its_likes(registry: Registry) -> None:
     """The error says what may have been meant."""
-    with pytest.raises(
-        UnknownTopicError, match="no topic 'sensor_acel' is defined; did you mean sensor_accel"
-    ):
+    with pytest.raises(UnknownTopicError, match="no topic 'sensor_acel' is defined; did you mean sensor_accel"):
         registry.type_for_topic("sensor_acel")
-    with pytest.raises(
-        UnknownTopicError, match="no message 'SensorAcel' is defined; did you mean SensorAccel"
-    ):
+    with pytest.raises(UnknownTopicError, match="no message 'SensorAcel' is defined; did you mean SensorAccel"):
         registry.load("SensorAcel")
     for call in (registry.load, registry.definition, registry.type_hash, registry.type_for_topic):
         for name in ("", "Nothing", "nothing", "../Cell", "Cell.msg", "None"):

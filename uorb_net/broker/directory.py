@@ -133,6 +133,12 @@ class Directory(ABC):
         words[W_HINT] = 1  # after `armed`: see docs/node.md, "Races"
         return True
 
+    def disarm(self, words: "memoryview[int]", number: int) -> None:
+        """Take the announcement of sleeper `number` back."""
+        for index in sleeper_entries(words):
+            if words[index] == number:
+                words[index + 1] = 0
+
     def _entry(self, words: "memoryview[int]", number: int) -> int:
         """Return the index of a sleeper's entry, claimed if need be; 0 where the table is full."""
         for index in sleeper_entries(words):

@@ -29,9 +29,7 @@ class BusSink:
         cls = _type_of(series)
         depth = min(DEPTH, max(DEPTH_BYTES // series.encoded_size, DEPTH_LEAST))
         try:
-            publication = self._broker.advertise_instance(
-                cls, series.topic, series.instance, queue_length=depth
-            )
+            publication = self._broker.advertise_instance(cls, series.topic, series.instance, queue_length=depth)
         except TopicMismatchError as error:
             self._refused(series, error)
         else:

@@ -223,9 +223,7 @@ class ULogReader:
             return
         self.compat_flags, self.incompat_flags, *offsets = _FLAGS.unpack_from(head, HEADER.size)
         if self.incompat_flags[0] & ~1 or any(self.incompat_flags[1:]):
-            raise LogError(
-                f"{self.path} needs a newer reader: incompatible flags {self.incompat_flags.hex()}"
-            )
+            raise LogError(f"{self.path} needs a newer reader: incompatible flags {self.incompat_flags.hex()}")
         if self.incompat_flags[0]:
             self.appended_offsets = tuple(offset for offset in offsets if offset)
 
@@ -304,9 +302,7 @@ class ULogReader:
         self._kept_bytes += len(body)
         if self._kept_bytes <= _KEPT_BYTES:
             return True
-        self._frames.fault(
-            self._frames.at, f"definitions and information beyond {_KEPT_BYTES} bytes are not kept"
-        )
+        self._frames.fault(self._frames.at, f"definitions and information beyond {_KEPT_BYTES} bytes are not kept")
         return False
 
     def _subscribe(self, body: bytes) -> Subscription:
