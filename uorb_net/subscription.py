@@ -340,6 +340,7 @@ class Subscription(Generic[M]):
         """Return G, after following a node that was moved."""
         while (word := self._words[W_G]) & MOVED:
             self._node.recover()
+            self._follow()  # the node may have moved before it knew this subscription
         return word
 
     def _follow(self) -> None:
@@ -370,9 +371,9 @@ class Subscription(Generic[M]):
         self.spend()
         if self._exported is not None:
             self._exported.close()
+        self._node.poke_own()  # before the sleepers' entries go
         members.unsubscribe(self._node, self)
         self._closed_by(self)
-        self._node.poke_own()
 
     def spend(self) -> None:
         """Make every later call raise ClosedError."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from uorb_net.cli.play import queue_length
+from uorb_net.logs.sink import queue_length
 from uorb_net.msg import VehicleAttitude
 
 LOGS = Path(__file__).parents[3] / "shared" / "ulg"

@@ -123,8 +123,8 @@ def hosts(tmp_path: Path) -> Iterator[tuple[Host, Host]]:
     for host in pair:
         host.start()
     try:
-        assert pair[0].says("peer companion is up", 15.0), pair[0].log.read_text()
-        assert pair[1].says("peer autopilot is up", 15.0), pair[1].log.read_text()
+        assert pair[0].says("peer: companion is up", 15.0), pair[0].log.read_text()
+        assert pair[1].says("peer: autopilot is up", 15.0), pair[1].log.read_text()
         yield pair
     finally:
         for host in pair:

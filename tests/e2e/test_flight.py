@@ -102,9 +102,9 @@ def test_a_killed_link_is_reported_and_the_flow_resumes(victim: int, hosts: Any,
         sleep(0.01)
     sleep(2.0)  # into the replay: the fault must hit a running flow
     killed.kill()
-    assert other.says(f"peer {killed.name} is down", 2.0)
+    assert other.says(f"peer: {killed.name} is down", 2.0)
     killed.start()
-    assert other.says(f"peer {killed.name} is up", 5.0, times=2)
+    assert other.says(f"peer: {killed.name} is up", 5.0, times=2)
     _, errors = player.communicate(timeout=30)
     assert player.returncode == 0, errors
     rows, _ = reader.rows()

@@ -196,7 +196,7 @@ def test_a_peer_that_stops_takes_its_topics_along_and_brings_them_back(vehicle: 
     assert subscription.wait(5.0)
     assert subscription.copy() == attitude(2)
     kinds = [event.text.split(",")[0] for event in other.events() if event.kind == "peer"]
-    assert kinds == ["peer autopilot is up", "peer autopilot is down", "peer autopilot is up"]
+    assert kinds == ["autopilot is up", "autopilot is down", "autopilot is up"]
 
 
 def test_a_topic_not_defined_here_is_mirrored_with_its_publishers_text(

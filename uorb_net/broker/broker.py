@@ -10,7 +10,7 @@ from ..errors import BusError, ClosedError, InstanceError, QueueLengthError, Unk
 from . import members
 from .directory import Directory, PrivateDirectory
 from .shared import process_directory
-from .survey import TopicStatus, survey
+from .survey import Survey, TopicStatus, survey
 
 if TYPE_CHECKING:
     from ..link import Link
@@ -154,18 +154,20 @@ class Broker:
             topic: the topic's name.
             instance: 0..9; others may share it.
             priority, queue_length: as for `advertise`.
+
+        Instance 0 is shared, as `advertise` has it; the others are own, as `advertise_multi` has them.
         """
         self._alive()
         if not 0 <= instance < members.INSTANCES:
             raise InstanceError(f"instance = {instance}: 0..{members.INSTANCES - 1}")
-        return self._join(type.__uorb__, topic, instance, int(priority), queue_length)
+        return self._join(type.__uorb__, topic, instance, int(priority), queue_length, own=instance > 0)
 
     def _advertise(
         self, topic: Any, instance: int | None, data: Any, priority: int, queue_length: int | None
     ) -> "Publication[Any]":
         self._alive()
         name, type_ = self.resolve(topic, instance or 0)
-        publication = self._join(type_.__uorb__, name, instance, int(priority), queue_length)
+        publication = self._join(type_.__uorb__, name, instance, int(priority), queue_length, own=instance is None)
         if data is not None:
             try:
                 publication.publish(data)
@@ -175,7 +177,14 @@ class Broker:
         return publication
 
     def _join(
-        self, type_: "MessageType", name: str, instance: int | None, priority: int, queue_length: int | None
+        self,
+        type_: "MessageType",
+        name: str,
+        instance: int | None,
+        priority: int,
+        queue_length: int | None,
+        *,
+        own: bool,
     ) -> "Publication[Any]":
         from ..publication import Publication
 
@@ -188,7 +197,7 @@ class Broker:
             instance,
             priority=priority,
             queue_length=queue_length,
-            own=instance is None,
+            own=own,
         )
         publication: Publication[Any] = Publication(node, priority, self._users.discard)
         self._users.add(publication)
@@ -250,8 +259,7 @@ class Broker:
             raise InstanceError(f"instance = {instance}: 0..{members.INSTANCES - 1}")
         if definition not in ("own", "publisher"):
             raise ValueError(f"definition = {definition!r}: own or publisher")
-        found = self._published(topic, instance) if definition == "publisher" else None
-        name, type_ = found or self.resolve(topic, instance)
+        name, type_ = self._choose(topic, instance) if definition == "publisher" else self.resolve(topic, instance)
         node = members.subscribe(self._directory, type_.__uorb__, name, instance)
         subscription: Subscription[Any] = Subscription(node, start, interval, self._users.discard)
         self._users.add(subscription)
@@ -262,11 +270,8 @@ class Broker:
     def exists(self, topic: Any, instance: int = 0) -> bool:
         """Tell whether someone, here or on another host, advertises the instance."""
         self._alive()
-        name, _ = self.resolve(topic, 0)
-        if not 0 <= instance < members.INSTANCES:
-            return False
-        mapping = self._directory.find(name, instance, populate=False)
-        return mapping is not None and members.advertised(self._directory, mapping)
+        name, _ = self.resolve(topic)
+        return 0 <= instance < members.INSTANCES and self._advertised(name, instance)
 
     def group_count(self, topic: Any) -> int:
         """Return how many instances of a topic are advertised."""
@@ -274,8 +279,12 @@ class Broker:
 
     def topics(self) -> list[TopicStatus]:
         """Return the status of every node, sorted by topic and instance."""
+        return [node.status for node in self.survey()]
+
+    def survey(self) -> list[Survey]:
+        """Return every node's status with what only tools ask: size, last write, definition."""
         self._alive()
-        return [node.status for node in survey(self._directory)]
+        return survey(self._directory)
 
     def resolve(self, topic: Any, instance: int = 0) -> tuple[str, "type[Message]"]:
         """Return a topic argument's name and type; the bus is asked where no definition is installed.
@@ -293,23 +302,44 @@ class Broker:
         try:
             return name, messages.type_for_topic(name)
         except UnknownTopicError:
-            found = self._published(name, instance)
+            found = self.type_on_bus(name, instance)
             if found is None:
                 raise
-            return found
+            return name, found
 
-    def _published(self, name: Any, instance: int) -> "tuple[str, type[Message]] | None":
-        """Return a topic's name and type as the bus has them; None if it has no such node."""
+    def _choose(self, topic: Any, instance: int) -> tuple[str, "type[Message]"]:
+        """Return a topic's name and its publisher's type, the installed one where nobody publishes."""
+        if not isinstance(topic, str) or not self.advertised(topic):
+            return self.resolve(topic, instance)
+        found = self.type_on_bus(topic, instance)
+        return (topic, found) if found is not None else self.resolve(topic, instance)
+
+    def advertised(self, topic: str, instance: int | None = None) -> bool:
+        """Tell whether somebody alive advertises a topic's instance, or any; False for an unknown name."""
+        if not topic.isidentifier():
+            return False
+        return any(self._advertised(topic, n) for n in range(members.INSTANCES) if instance in (None, n))
+
+    def _advertised(self, topic: str, instance: int) -> bool:
+        mapping = self._directory.find(topic, instance, populate=False)
+        return mapping is not None and members.advertised(self._directory, mapping)
+
+    def type_on_bus(self, topic: str, instance: int = 0) -> "type[Message] | None":
+        """Return the type a topic has on the bus, whatever is installed here; None if nobody brought one.
+
+        A node that somebody alive advertises counts first, the instance asked for before the others.
+        """
         from .. import messages
 
-        if not isinstance(name, str) or not name.isidentifier():
+        if not topic.isidentifier():
             return None
-        for known in (instance, *range(members.INSTANCES)):
-            mapping = self._directory.find(name, known, populate=False)
-            if mapping is not None:
-                label = mapping.label()
-                return name, messages.from_text(label.type_name, label.definition)
-        return None
+        found = [self._directory.find(topic, n, populate=False) for n in (instance, *range(members.INSTANCES))]
+        mappings = [mapping for mapping in found if mapping is not None]
+        mappings.sort(key=lambda mapping: not members.advertised(self._directory, mapping))
+        if not mappings:
+            return None
+        label = mappings[0].label()
+        return messages.from_text(label.type_name, label.definition)
 
     # -- closing -----------------------------------------------------------------------------------
 

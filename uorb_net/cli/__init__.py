@@ -24,7 +24,7 @@ VERBS = {
     "listener": "print samples of a topic",
     "pub": "publish a message given as JSON",
     "play": "play a ULog file onto the bus",
-    "demo": "publish the topics of a simulated vehicle",
+    "demo": "show a vehicle of two hosts on this machine",
 }
 EXAMPLES = """examples:
   uorb ls

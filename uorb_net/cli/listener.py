@@ -8,7 +8,7 @@ from typing import Any
 from ..errors import NoDataError
 from ..subscription import Sample, Subscription
 from .carried import opened
-from .in_use import is_advertised, subscribe_as, type_in_use
+from .in_use import type_in_use
 from .options import Parser, add_common, count, instance, rate, seconds
 from .values import dumps, plain, text_lines
 
@@ -43,12 +43,13 @@ def run(args: argparse.Namespace) -> int:
     interval = 1.0 / args.rate if args.rate else 0.0
     with opened(args) as bus:
         deadline = monotonic() + args.timeout
-        type_ = type_in_use(bus, args.topic, args.instance, deadline)
-        with subscribe_as(bus.broker, type_, args.topic, args.instance, interval=interval) as subscription:
+        type_in_use(bus, args.topic, args.instance, deadline)
+        topic: tuple[str, int] = args.topic, args.instance
+        with bus.broker.subscribe(*topic, interval=interval, definition="publisher") as subscription:
             for number in range(1, wanted + 1):
                 sample = _next(subscription, deadline)
                 if sample is None:
-                    known = number > 1 or is_advertised(bus.broker, args.topic, args.instance)
+                    known = number > 1 or bus.broker.advertised(*topic)
                     return _give_up(known, args.timeout)
                 _show(subscription, sample, number, as_json=args.json)
                 deadline = monotonic() + args.timeout + interval

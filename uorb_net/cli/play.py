@@ -3,22 +3,16 @@
 import argparse
 import sys
 from time import monotonic, sleep
-from typing import TYPE_CHECKING, Any
 
-from ..errors import TopicMismatchError, UorbError
+from ..errors import UorbError
 from ..logs.player import Played, Progress, Series, play
+from ..logs.sink import BusSink
 from . import complain
-from .carried import Bus, opened
-from .in_use import advertise_as
-from .options import INSTANCES, Parser, add_common, speed
+from .carried import opened
+from .options import Parser, add_common, speed
 from .values import dumps
 
-if TYPE_CHECKING:
-    from ..publication import Publication
-
 TAIL = 1.0  # seconds the topics stay advertised after the last sample, for readers to empty their queues
-DEEPEST, SHALLOWEST = 255, 64
-QUEUE_BYTES = 1 << 20  # of one series' queue, where that leaves SHALLOWEST
 _NAME = "uorb play"
 
 
@@ -42,58 +36,13 @@ def add(parser: Parser) -> None:
     add_common(parser)
 
 
-class BusSink:
-    """Publishes a player's series on a bus; a series that cannot be advertised there is left out."""
-
-    def __init__(self, bus: Bus) -> None:
-        self._broker = bus.broker
-        self._publications: dict[Series, Publication[Any]] = {}
-        self.refused = 0
-        self.rows = 0
-
-    def advertise(self, series: Series) -> None:
-        """Advertise the series with the log's definition, or say why not."""
-        from .. import messages
-
-        name = f"{series.topic} instance {series.instance}" if series.instance else series.topic
-        try:
-            if series.instance >= INSTANCES:
-                raise UorbError(f"instances are 0..{INSTANCES - 1}")
-            self._publications[series] = advertise_as(
-                self._broker,
-                messages.from_text(series.type_name, series.definition),
-                series.topic,
-                series.instance,
-                queue_length=queue_length(series.encoded_size),
-            )
-        except (TopicMismatchError, UorbError) as error:
-            self.refused += 1
-            complain(_NAME, f"{name} is not played: {error}")
-
-    def publish(self, series: Series, payload: bytes) -> None:
-        """Publish a sample as the log has it."""
-        publication = self._publications.get(series)
-        if publication is not None:
-            publication.publish_encoded(payload)
-            self.rows += 1
-
-    @property
-    def playing(self) -> int:
-        """How many series are advertised."""
-        return len(self._publications)
-
-
-def queue_length(size: int) -> int:
-    """Return how many samples of so many bytes a series keeps for its readers."""
-    return min(DEEPEST, max(SHALLOWEST, QUEUE_BYTES // size))
-
-
 def run(args: argparse.Namespace) -> int:
     """Play, and return 1 if not all that was asked for could be played."""
     with opened(args) as bus:
         if not bus.wait_for_peer():
             complain(_NAME, "no other host was reached yet; playing for this one")
-        sink = BusSink(bus)
+        refused: list[Series] = []
+        sink = BusSink(bus.broker, lambda series, error: _refuse(refused, series, error))
         line = ProgressLine(args.rate)
         began = monotonic()
         try:
@@ -110,10 +59,10 @@ def run(args: argparse.Namespace) -> int:
         seconds = monotonic() - began
         if sink.rows:
             sleep(TAIL)
-    return _report(args, sink, played, seconds)
+    return _report(args, sink, played, seconds, bool(refused))
 
 
-def _report(args: argparse.Namespace, sink: BusSink, played: Played, seconds: float) -> int:
+def _report(args: argparse.Namespace, sink: BusSink, played: Played, seconds: float, refused: bool) -> int:
     if not played.series:
         what = f"no topic with samples matches {' '.join(args.topics)}" if args.topics else "no samples"
         return complain(_NAME, f"{args.file}: {what}{f'; {played.problem}' if played.problem else ''}")
@@ -130,7 +79,13 @@ def _report(args: argparse.Namespace, sink: BusSink, played: Played, seconds: fl
         print(f"played {sink.rows} rows of {sink.playing} series in {seconds:.1f} s")
     if played.problem:
         return complain(_NAME, f"{args.file} is damaged: {played.problem}; what is whole was played")
-    return 1 if sink.refused else 0
+    return int(refused)
+
+
+def _refuse(refused: list[Series], series: Series, error: UorbError) -> None:
+    refused.append(series)
+    name = f"{series.topic} instance {series.instance}" if series.instance else series.topic
+    complain(_NAME, f"{name} is not played: {error}")
 
 
 class ProgressLine:

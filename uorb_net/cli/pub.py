@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import EncodeError
 from . import UsageError
 from .carried import PEER_WAIT, Bus, opened
-from .in_use import advertise_as, type_in_use
+from .in_use import type_in_use
 from .options import Parser, add_common, count, instance, rate, seconds
 from .values import loads, message_from
 
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         # Without a link only who is on the bus already can have brought a definition.
         wait = TYPE_WAIT if bus.link else 0.0
         message = _message(type_in_use(bus, args.topic, args.instance, monotonic() + wait), fields)
-        with advertise_as(bus.broker, type(message), args.topic, args.instance) as publication:
+        with bus.broker.advertise_instance(type(message), args.topic, args.instance) as publication:
             return _publish(args, bus, publication, message)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from ..broker.survey import Survey, survey
+from ..broker.survey import Survey
 from ..clock import hrt_absolute_time
 from .carried import Bus, opened
 from .options import Parser, add_common
@@ -107,7 +107,7 @@ def look(bus: Bus, filters: Sequence[str] = ()) -> Look:
     """Look at the nodes whose topics the filters want."""
     nodes = {
         (node.status.topic, node.status.instance): node
-        for node in survey(bus.broker._directory)
+        for node in bus.broker.survey()
         if wanted(node.status.topic, filters)
     }
     return Look(monotonic(), nodes, _link_lost(bus, nodes))

@@ -3,7 +3,7 @@
 from random import Random
 from time import monotonic
 
-from ..errors import TopicMismatchError
+from ..errors import UorbError
 from ..logs.player import Series, play
 from ..logs.sink import BusSink
 from ..logs.ulog import LogError
@@ -59,7 +59,7 @@ class Stage:
         self._host = host
         self._bus = BusSink(host.broker, self._refused)
 
-    def _refused(self, series: Series, error: TopicMismatchError) -> None:
+    def _refused(self, series: Series, error: UorbError) -> None:
         raise error  # the bus is the demo's own: nobody else can have been here before
 
     def advertise(self, series: Series) -> None:

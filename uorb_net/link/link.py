@@ -291,7 +291,7 @@ class Link:
             self._changed.notify_all()
         if changed and name != "connecting":
             seconds = (state.since_us - since) / 1e6
-            text = f"peer {state.peer.host} is {name}, after {seconds:.1f} s {before}"
+            text = f"{state.peer.host} is {name}, after {seconds:.1f} s {before}"
             self._events.add("peer", text, peer=state.peer.host)
 
     def _ping(self) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ..broker.broker import Broker
-from ..errors import TopicMismatchError, UorbError
+from ..errors import UorbError
 from ..messages import Message, from_text, type_for_topic
 from ..messages.compare import difference
 from ..publication import Publication
@@ -12,25 +12,26 @@ from .player import Series
 
 DEPTH = 255  # samples, while they fit in this many bytes:
 DEPTH_BYTES = 1 << 20
-DEPTH_LEAST = 4
+DEPTH_LEAST = 64
 
 
 class BusSink:
     """Publishes a log's series on a broker, under the log's instance numbers, with its definitions."""
 
-    def __init__(self, broker: Broker, refused: Callable[[Series, TopicMismatchError], object]) -> None:
-        """Publish on `broker`; `refused` hears of each series that the bus uses with another definition."""
+    def __init__(self, broker: Broker, refused: Callable[[Series, UorbError], object]) -> None:
+        """Publish on `broker`; `refused` hears of each series that cannot be advertised, and why."""
         self._broker = broker
         self._refused = refused
+        self.rows = 0
         self._publications: dict[Series, Publication[Any]] = {}
 
     def advertise(self, series: Series) -> None:
         """Advertise a series, or report that it cannot be."""
         cls = _type_of(series)
-        depth = min(DEPTH, max(DEPTH_BYTES // series.encoded_size, DEPTH_LEAST))
+        depth = queue_length(series.encoded_size)
         try:
             publication = self._broker.advertise_instance(cls, series.topic, series.instance, queue_length=depth)
-        except TopicMismatchError as error:
+        except UorbError as error:
             self._refused(series, error)
         else:
             self._publications[series] = publication
@@ -40,12 +41,23 @@ class BusSink:
         publication = self._publications.get(series)
         if publication is not None:
             publication.publish_encoded(payload)
+            self.rows += 1
+
+    @property
+    def playing(self) -> int:
+        """How many series are advertised."""
+        return len(self._publications)
 
     def close(self) -> None:
         """Take every advertisement back."""
         for publication in self._publications.values():
             publication.unadvertise()
         self._publications.clear()
+
+
+def queue_length(size: int) -> int:
+    """Return how many samples of `size` bytes a played series keeps for its readers."""
+    return min(DEPTH, max(DEPTH_LEAST, DEPTH_BYTES // size))
 
 
 def _type_of(series: Series) -> type[Message]:
