@@ -5,6 +5,7 @@ from time import monotonic_ns
 from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar, cast
 
 from .broker import members
+from .broker.layout import MOVED, W_G
 from .errors import ClosedError, TopicMismatchError
 
 if TYPE_CHECKING:
@@ -50,7 +51,10 @@ class Publication(Generic[M]):
     @property
     def queue_length(self) -> int:
         """The queue length in force, which the node's first publisher chose."""
-        return self._node.mapping.queue_length
+        node = self._node
+        if node.mapping.words[W_G] & MOVED:
+            node.recover()
+        return node.mapping.queue_length
 
     def publish(self, message: M) -> None:
         """Write a message to the bus; never blocks on a subscriber or on the network.

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
 from .broker import members
 from .broker.layout import FLAG_LATCHED, GENERATION, MOVED, UNADVERTISED, W_FLOOR, W_G, W_LAPSED, W_PRIORITY
 from .broker.slots import Sample as Slot
-from .broker.slots import decoded, read
-from .errors import ClosedError, NoDataError
+from .broker.slots import damaged, decoded, read
+from .clock import hrt_absolute_time
+from .errors import ClosedError, DecodeError, NoDataError
 from .waiting import wait_for_one
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ class Subscription(Generic[M]):
 
     __slots__ = (
         "_closed", "_closed_by", "_decode", "_exported", "_interval", "_last", "_lost", "_mapping", "_node",
-        "_position", "_quiet", "_words", "queue_size",
+        "_position", "_quiet", "_since", "_words", "queue_size",
     )  # fmt: skip
 
     def __init__(
@@ -79,6 +80,7 @@ class Subscription(Generic[M]):
         self.queue_size = 0
         self._words: memoryview[int] = node.mapping.words
         self._follow()
+        self._since = hrt_absolute_time() if start == "new" else 0  # until when latched samples are no update
         self._begin(start)
         self._interval = _seconds(interval)
         members.enlist(node, self)
@@ -156,6 +158,7 @@ class Subscription(Generic[M]):
     @property
     def interval(self) -> float:
         """The least time between two updates, seconds; 0: none."""
+        self._words[W_G]
         return self._interval
 
     @interval.setter
@@ -192,9 +195,25 @@ class Subscription(Generic[M]):
         if word <= self._position or word <= self._words[W_FLOOR]:
             self._quiet = word
             return False
+        if self._since and not self._pass_latched(word):
+            return False
         if self._interval and monotonic() - self._last < self._interval:
             return False
         return self._node.publishing > 0 or self._published()
+
+    def _pass_latched(self, word: int) -> bool:
+        """Step over latched samples that were published before this subscription; True if another is unread.
+
+        For `start="new"` they can be copied, but are no update.
+        """
+        for number in range(max(self._position, self._words[W_FLOOR], word - self._mapping.queue_length), word):
+            slot = read(self._mapping, number)
+            if slot is None or not slot.flags & FLAG_LATCHED or slot.published_us > self._since:
+                self._since = 0  # the flow has begun: what is latched comes first and alone
+                return True
+            self._position = number + 1
+        self._quiet = word
+        return False
 
     def copy(self) -> M:
         """Return the newest sample, or the next unread one of a queue.
@@ -202,6 +221,7 @@ class Subscription(Generic[M]):
         Raises:
             NoDataError: nothing was published in this advertisement, or nobody advertises.
             ClosedError: the subscription is closed.
+            DecodeError: the sample's bytes were damaged, by whatever writes to foreign memory; it counts as lost.
         """
         while True:
             number = self._choose()
@@ -214,7 +234,7 @@ class Subscription(Generic[M]):
                 self._node.cache = (number + 1, cast("Message", message))
                 self._advance(number)
                 return message
-            # Overtaken while reading: choose again.
+            self._failed(number)
 
     def copy_with_info(self) -> Sample[M]:
         """Return what `copy` does, with its `SampleInfo`; raises as `copy`."""
@@ -224,10 +244,25 @@ class Subscription(Generic[M]):
             if slot is not None:
                 self._advance(number)
                 return Sample(self._decode(slot.payload, 0), self._info(slot))
+            self._failed(number)
+
+    def _failed(self, number: int) -> None:
+        """Choose again after a write that was overtaken while it was read; pass over one whose bytes are damaged."""
+        if damaged(self._mapping, number):
+            unread = number >= self._position
+            self._advance(number)
+            if unread:
+                self._count_lost(number, 1)
+            raise DecodeError(f"{self._node.name}: sample {number + 1} is damaged in the bus's memory")
 
     def update(self) -> M | None:
         """Return `copy()` if `check()`, else None."""
-        return self.copy() if self.check() else None
+        if not self.check():
+            return None
+        try:
+            return self.copy()
+        except NoDataError:
+            return None  # unadvertised between the two
 
     def _choose(self) -> int:
         """Return the number of the write to deliver."""
@@ -280,6 +315,8 @@ class Subscription(Generic[M]):
             slot = read(self._mapping, word - 1)
             if slot is not None:
                 return slot.received_us
+            if damaged(self._mapping, word - 1):
+                return 0
 
     # -- waiting -----------------------------------------------------------------------------------
 
@@ -349,6 +386,8 @@ class Subscription(Generic[M]):
             return
         self._mapping = self._node.mapping
         self._words = self._mapping.words
+        if self.closed:  # by another thread, just now
+            self.spend()
 
     def _published(self) -> bool:
         """Tell whether a publisher lives; asked of the kernel at most twice a second."""

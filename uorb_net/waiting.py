@@ -9,6 +9,7 @@ from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any
 
 from .broker.waking import LOOKS, Sleeper, give_back, take
+from .errors import ClosedError
 
 if TYPE_CHECKING:
     from .subscription import Subscription
@@ -53,6 +54,9 @@ def wait_for(subscriptions: "Sequence[Subscription[Any]]", timeout: float | None
     sleeper = take()
     try:
         return _sleep(subscriptions, sleeper, deadline)
+    except ClosedError:
+        sleeper.leave_closed()
+        raise
     finally:
         give_back(sleeper)
 
@@ -86,6 +90,9 @@ def wait_for_one(subscription: "Subscription[Any]", timeout: float | None) -> bo
                 look += 1
             if subscription.check():
                 return True
+    except ClosedError:
+        sleeper.leave_closed()
+        raise
     finally:
         give_back(sleeper)
 

@@ -42,6 +42,22 @@ def test_late_subscriber_gets_the_newest_sample_latched_and_once(vehicle: Any) -
     assert 0 < sample.info.published_us <= sample.info.received_us
 
 
+def test_a_new_subscription_can_copy_the_latched_sample_but_gets_no_update(vehicle: Any, eventually: Until) -> None:
+    """start="new": what was published before is there, and is no news."""
+    autopilot, _ = vehicle.host("autopilot")
+    companion, _ = vehicle.host("companion")
+    publication = autopilot.advertise(VehicleAttitude, attitude(1), queue_length=4)
+    assert eventually(lambda: companion.exists("vehicle_attitude"))
+    subscription = companion.subscribe(VehicleAttitude, start="new")
+    assert eventually(lambda: companion.topics()[0].generation == 1)
+    assert not subscription.wait(0.05)
+    assert subscription.copy() == attitude(1)
+    publication.publish(attitude(2))
+    assert subscription.wait(5.0)
+    assert subscription.copy() == attitude(2)
+    assert subscription.lost == 0
+
+
 def test_a_burst_on_a_queue_arrives_complete_and_in_order(vehicle: Any) -> None:
     """A queued topic loses nothing while the queue reaches."""
     autopilot, _ = vehicle.host("autopilot")

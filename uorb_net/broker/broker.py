@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 from ..errors import BusError, ClosedError, InstanceError, QueueLengthError, UnknownTopicError
 from . import members
 from .directory import Directory, PrivateDirectory
+from .layout import is_topic
 from .shared import process_directory
 from .survey import Survey, TopicStatus, survey
 
@@ -261,7 +262,11 @@ class Broker:
             raise ValueError(f"definition = {definition!r}: own or publisher")
         name, type_ = self._choose(topic, instance) if definition == "publisher" else self.resolve(topic, instance)
         node = members.subscribe(self._directory, type_.__uorb__, name, instance)
-        subscription: Subscription[Any] = Subscription(node, start, interval, self._users.discard)
+        try:
+            subscription: Subscription[Any] = Subscription(node, start, interval, self._users.discard)
+        except BaseException:
+            members.give_up(node)
+            raise
         self._users.add(subscription)
         return subscription
 
@@ -316,7 +321,7 @@ class Broker:
 
     def advertised(self, topic: str, instance: int | None = None) -> bool:
         """Tell whether somebody alive advertises a topic's instance, or any; False for an unknown name."""
-        if not topic.isidentifier():
+        if not is_topic(topic):
             return False
         return any(self._advertised(topic, n) for n in range(members.INSTANCES) if instance in (None, n))
 
@@ -331,7 +336,7 @@ class Broker:
         """
         from .. import messages
 
-        if not topic.isidentifier():
+        if not is_topic(topic):
             return None
         found = [self._directory.find(topic, n, populate=False) for n in (instance, *range(members.INSTANCES))]
         mappings = [mapping for mapping in found if mapping is not None]
@@ -375,7 +380,7 @@ class Broker:
         return f"<Broker {self.vehicle} {self.path}>"
 
 
-_brokers: set[Broker] = set()  # dropping the last reference closes nothing (api.md)
+_brokers: set[Broker] = set()  # dropping the last reference closes nothing
 
 
 def _close_all() -> None:

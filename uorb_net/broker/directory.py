@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 from threading import RLock
 from typing import TYPE_CHECKING
 
-from .layout import MAGIC, SLEEPERS, W_G, W_HINT, W_MAGIC, W_SLEEPERS, Label, Shape, format_node
+from .layout import MAGIC, SLEEPERS, W_G, W_HINT, W_MAGIC, W_SLEEPERS, Label, Shape, format_node, node_name
 from .mapping import Mapping
 from .tables import claim_sleeper, sleeper_entries
 from .waking import End, forget_directory, poke
@@ -116,8 +116,10 @@ class Directory(ABC):
 
     def poke(self, number: int) -> None:
         """Wake the sleeper with FIFO `number`."""
-        if (number in self.fds or self.open_end(number)) and not poke(self.fds[number]):
-            self.forget_end(number)
+        if number in self.fds or self.open_end(number):
+            fd = self.fds.get(number)
+            if fd is not None and not poke(fd):  # None: another thread has just found it dead
+                self.forget_end(number)
 
     def dead_end(self, number: int) -> bool:
         """Tell whether FIFO `number` has no owner any more."""
@@ -157,7 +159,12 @@ class Directory(ABC):
     def close(self) -> None:
         """Give up this process's place in the directory; every node must be closed before."""
         self.closed = True
-        forget_directory(self)
+        for number in forget_directory(self):
+            self._ends.pop(number, None)  # a thread still sleeps there: it closes it when it finds out
+        for end in self._ends.values():
+            end.close()
+        self._ends.clear()
+        self.fds.clear()
 
     def abandon(self) -> None:
         """Forget everything in a forked child: what is open there is its parent's."""
@@ -210,6 +217,7 @@ class PrivateDirectory(Directory):
         return self._files.get((topic, instance))
 
     def install(self, label: Label, shape: Shape, fill: Filler | None = None) -> Mapping:
+        node_name(label.topic, label.instance)  # refuses what the shared bus refuses
         buffer = bytearray(shape.size)
         format_node(buffer, label, shape)
         self._count += 1
@@ -241,10 +249,3 @@ class PrivateDirectory(Directory):
 
     def sweep(self) -> None:
         return  # nobody else can have left anything
-
-    def close(self) -> None:
-        super().close()
-        for end in self._ends.values():
-            end.close()
-        self._ends.clear()
-        self.fds.clear()

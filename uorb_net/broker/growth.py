@@ -71,6 +71,7 @@ def replace(node: Node, queue_length: int, retained: int = 0) -> None:
         mapping = node.directory.install(node.label, shape, _Copy(old))
         poke_sleepers(node.directory, old)
     node.adopt(mapping)
+    node.write_deferred()
 
 
 def supersede(directory: Directory, old: Mapping, label: Label, shape: Shape) -> Mapping:

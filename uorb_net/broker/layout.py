@@ -5,14 +5,18 @@ which CPython does with a single instruction. Word indices below are byte offset
 `docs/node.md` explains who may write which word, under what.
 """
 
+from errno import EINVAL
 from os import uname
 from struct import Struct
 from typing import Any, Final
 
 import msgspec
 
+from ..errors import BusError
+
 MAGIC: Final = 0x754F5242_00000001  # "uORB" and the layout version
 PAGE: Final = 4096
+TOPIC_SIZE: Final = 128  # bytes of a topic's name
 
 # -- header words ---------------------------------------------------------------------------------
 W_MAGIC: Final = 0
@@ -85,6 +89,22 @@ class Shape(msgspec.Struct, frozen=True):
     def size(self) -> int:
         """Bytes of the whole node, whole pages."""
         return pages(self.base + self.slots * self.stride)
+
+
+def is_topic(name: str) -> bool:
+    """Tell whether a name can be a topic's: it becomes a file name, and may come from another host."""
+    return name.isidentifier() and len(name.encode()) <= TOPIC_SIZE
+
+
+def node_name(topic: str, instance: int) -> str:
+    """Return the file name of a node.
+
+    Raises:
+        BusError: no topic can have that name.
+    """
+    if not is_topic(topic):
+        raise BusError(EINVAL, f"topic {topic[:TOPIC_SIZE]!r}: letters, digits and _ only, at most {TOPIC_SIZE} bytes")
+    return f"{topic}.{instance}" if instance else topic
 
 
 def pages(count: int) -> int:

@@ -39,8 +39,8 @@ def open_node(directory: Directory, type_: "MessageType", topic: str, instance: 
         TopicMismatchError: a live local publisher or subscriber uses another definition.
     """
     node = directory.nodes.get((topic, instance))
-    if node is not None and node.mapping.words[W_G] & MOVED:
-        node.remap()
+    if node is not None and not _follow(node):
+        node = None
     mapping = node.mapping if node is not None else _found(directory, topic, instance)
     label = Label(topic, instance, type_.name, type_.type_hash, type_.full_definition)
     if mapping is None:
@@ -100,20 +100,28 @@ def advertise(
             instance = lowest_free(directory, topic)
         wanted = queue_length or type_.queue_length or 1
         node = open_node(directory, type_, topic, instance, wanted)
-        purge(node.mapping.words, directory.alive)
-        fresh = not any(shares(node.mapping.words))
-        if wanted != node.mapping.queue_length and (fresh or (queue_length and not readable(node.mapping))):
-            replace(node, wanted, deepest(node.mapping))
-        words = node.mapping.words
-        origin = node.mapping.origin_index(host) if host else 0
-        if fresh:
-            begin_advertisement(words, priority)
-        add_share(words, node.name, Share(0, directory.me, 1, priority, origin, own))
         node.users += 1
+        try:
+            _claim(node, Share(0, directory.me, 1, priority, 0, own), wanted, bool(queue_length), host)
+        except BaseException:
+            _release(node)
+            raise
         node.publishing += 1
         node.settle_writers(newcomer=node.publishing == 1)
         directory.announce()
         return node
+
+
+def _claim(node: Node, share: Share, wanted: int, explicit: bool, host: str) -> None:
+    """Enter a publication into the node's table; `wanted` is its queue length, `explicit` where it was asked for."""
+    purge(node.mapping.words, node.directory.alive)
+    fresh = not any(shares(node.mapping.words))
+    if wanted != node.mapping.queue_length and (fresh or (explicit and not readable(node.mapping))):
+        replace(node, wanted, deepest(node.mapping))
+    words = node.mapping.words
+    if fresh:
+        begin_advertisement(words, share.priority)
+    add_share(words, node.name, share._replace(origin=node.mapping.origin_index(host) if host else 0))
 
 
 def unadvertise(node: Node, host: str = "") -> None:
@@ -137,6 +145,12 @@ def subscribe(directory: Directory, type_: "MessageType", topic: str, instance: 
         node = open_node(directory, type_, topic, instance, type_.queue_length or 1)
         node.users += 1
         return node
+
+
+def give_up(node: Node) -> None:
+    """Undo `subscribe` where `enlist` failed."""
+    with node.directory.hold():
+        _release(node)
 
 
 def enlist(node: Node, subscription: "Subscription[Any]") -> None:
@@ -197,7 +211,8 @@ def lowest_free(directory: Directory, topic: str) -> int:
     """Return the lowest instance that nobody alive advertises (under the directory lock)."""
     for instance in range(INSTANCES):
         node = directory.nodes.get((topic, instance))
-        mapping = node.mapping if node is not None else directory.find(topic, instance)
+        known = node is not None and _follow(node)
+        mapping = node.mapping if node is not None and known else directory.find(topic, instance)
         if mapping is None or not advertised(directory, mapping):
             return instance
     raise InstanceError(f"{topic}: all {INSTANCES} instances are advertised")

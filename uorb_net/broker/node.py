@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..messages import Message, MessageType
     from ..subscription import Subscription
 
-WRITE_WAIT = 0.1  # seconds a publish waits for a co-publisher that was stopped (api.md)
+WRITE_WAIT = 0.1  # seconds a publish waits for a co-publisher that was stopped
 JOIN_PAUSE = 0.001  # seconds; a thousand times longer than a store lingers in a store buffer
 
 Fields = tuple[bytes, int, int, int, int, int]  # payload, published, received, sequence, origin, flags
@@ -113,7 +113,7 @@ class Node:
         if not done:
             self._write_slowly((payload, published_us, received_us, sequence, origin, flags))
         if self._deferred:
-            self._write_deferred()
+            self.write_deferred()
         words = self.mapping.words
         if words[W_HINT]:
             wake(self.directory, words)
@@ -148,9 +148,14 @@ class Node:
         if origin:
             words[W_REMOTE] += 1
 
-    def _write_deferred(self) -> None:
-        while self._deferred:
-            self.write(*self._deferred.pop(0))
+    def write_deferred(self) -> None:
+        """Write what signal handlers published while this thread was busy with the node."""
+        while True:
+            try:
+                fields = self._deferred.pop(0)
+            except IndexError:
+                return  # all written, perhaps by another thread
+            self.write(*fields)
 
     @contextmanager
     def _exclusion(self, mapping: Mapping) -> Iterator[None]:
@@ -227,8 +232,10 @@ class Node:
         if current is None or current.label().type_hash != self.label.type_hash:
             raise ClosedError(f"{self.name} was replaced on the bus by another definition")
         if current.identity == self.mapping.identity:
-            # Whoever marked it was killed before the rename; nobody can have written to its copy.
-            current.words[W_G] &= ~MOVED
+            if current.words[W_G] & MOVED:
+                # Whoever marked it was killed before the rename; nobody can have written to its copy.
+                # Never without the mark: another thread may have followed already, and G be written to.
+                current.words[W_G] &= ~MOVED
             return
         self.adopt(current)
 
@@ -262,8 +269,12 @@ class Node:
         """Stop every writer of the node, in all processes (under the directory lock)."""
         with self._lock:
             self._joining = True
-            with self._exclusion(self.mapping):
-                yield
+            self._writing = True  # what a signal handler publishes meanwhile comes after
+            try:
+                with self._exclusion(self.mapping):
+                    yield
+            finally:
+                self._writing = False
 
     def leave_writers(self) -> None:
         """Write no more: the last publication of this process is going (under the directory lock)."""

@@ -10,7 +10,7 @@ import mmap
 import os
 import stat
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from struct import pack, unpack
 from tempfile import gettempdir
 from threading import RLock
@@ -19,7 +19,7 @@ from typing import TypeVar
 
 from ..errors import BusError, ClosedError
 from .directory import B_END, B_HOLDER, B_PROCESS, BUS_SIZE, LOCK_WAIT, Directory, Filler
-from .layout import MAGIC, W_MAGIC, Label, Shape, format_node
+from .layout import MAGIC, W_MAGIC, Label, Shape, format_node, node_name
 from .mapping import Mapping
 from .waking import End
 
@@ -89,8 +89,12 @@ class SharedDirectory(Directory):
         self._lock_fd = self._open(".lock")
         self._alive_fd = self._open(".alive")
         self.me = 0
-        with self.hold():
-            self._settle()
+        try:
+            with self.hold():
+                self._settle()
+        except BaseException:
+            self._close_descriptors()
+            raise
 
     # -- the directory lock ------------------------------------------------------------------------
 
@@ -101,6 +105,8 @@ class SharedDirectory(Directory):
         if not self._threads.acquire(timeout=max(wait, 0.0)):
             raise BusError(errno.EAGAIN, f"{self.path}: a thread of this process holds the directory lock")
         try:
+            if self.closed:  # while this thread waited for its turn
+                raise ClosedError(f"the bus {self.path} was closed: make a new Broker")
             if not self._depth:
                 self._flock(wait)
             self._depth += 1
@@ -142,20 +148,21 @@ class SharedDirectory(Directory):
         """Open the folder's .bus, made or made anew where nobody lives; take a process number."""
         lonely = not self._anybody()
         words = self._bus(self._open(".bus"))
-        if words[W_MAGIC] != MAGIC:
-            if not lonely:
-                raise BusError(errno.EPROTO, self._foreign(words[W_MAGIC]))
-            words[W_MAGIC] = 0
+        foreign = words[W_MAGIC] != MAGIC
+        if foreign and not lonely:
+            raise BusError(errno.EPROTO, self._foreign(words[W_MAGIC]))
         if lonely:
+            words[W_MAGIC] = 0
             self._empty()
-            for index in range(W_MAGIC + 4, len(words)):  # numbers are never reused, so they stay
+            for index in range(1 if foreign else B_HOLDER + 1, len(words)):  # numbers are never reused, so they stay
                 words[index] = 0
         words[W_MAGIC] = MAGIC
         words[B_PROCESS] += 1
         self.bulletin = words
         self.me = words[B_PROCESS]
         self._ofd(F_OFD_SETLK, fcntl.F_WRLCK, ALIVE_BASE + self.me, 1)
-        os.pwrite(self._alive_fd, pack("<Q", os.getpid()), 8 * self.me)
+        with suppress(OSError):  # file system full: only messages miss it
+            os.pwrite(self._alive_fd, pack("<Q", os.getpid()), 8 * self.me)
         self.sweep()
 
     def _bus(self, fd: int) -> "memoryview[int]":
@@ -236,7 +243,7 @@ class SharedDirectory(Directory):
     def install(self, label: Label, shape: Shape, fill: Filler | None = None) -> Mapping:
         name = node_name(label.topic, label.instance)
         building = f".{name}.new"
-        fd = more_descriptors(lambda: self._open(building))
+        fd = more_descriptors(lambda: self._open(building, os.O_CREAT | os.O_TRUNC))  # a kill may have left one
         try:
             self._allocate(fd, shape.size, building)
             buffer = more_descriptors(lambda: mmap.mmap(fd, shape.size, flags=MAP_FLAGS))
@@ -340,13 +347,11 @@ class SharedDirectory(Directory):
     # -- leaving -----------------------------------------------------------------------------------
 
     def close(self) -> None:
-        if self.closed:
-            return
-        super().close()
-        self._close_descriptors()
-        for end in self._ends.values():
-            end.close()
-        self._ends.clear()
+        with self._threads:
+            if self.closed:
+                return
+            self._close_descriptors()
+            super().close()
 
     def _close_descriptors(self) -> None:
         others = [fd for number, fd in self.fds.items() if number not in self._ends]
@@ -356,16 +361,15 @@ class SharedDirectory(Directory):
         self.fds.clear()
 
     def abandon(self) -> None:
+        if self.closed:  # by another broker of the same folder
+            return
         super().abandon()
         self._close_descriptors()
+        for node in self.nodes.values():
+            node.close()  # a copy of its flock descriptor would keep a dead parent's lock
         for end in self._ends.values():
             os.close(end.fd)
         self._ends.clear()
-
-
-def node_name(topic: str, instance: int) -> str:
-    """Return the file name of a node."""
-    return f"{topic}.{instance}" if instance else topic
 
 
 def process_directory(vehicle: str) -> SharedDirectory:

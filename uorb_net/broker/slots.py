@@ -9,6 +9,7 @@ slot and G on both sides (for payloads too long to sum). So correctness never re
 from collections.abc import Callable
 from struct import Struct
 from threading import Lock
+from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from zlib import crc32
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 Pack = Callable[..., None]
+PATIENCE = 0.1  # seconds; stores become visible to other processors within microseconds
 CRC_RESIDUE = 0x2144DF1C  # crc32 of anything followed by its own crc32 (little endian)
 
 
@@ -88,6 +90,17 @@ def decoded(mapping: "Mapping", number: int, decode: Callable[[Any, int], T]) ->
 def read(mapping: "Mapping", number: int) -> Sample | None:
     """Return write `number` (from 0) with its header; None if it was overtaken or is torn."""
     return decoded(mapping, number, lambda buffer, at: _sample(buffer, at, mapping.length))
+
+
+def damaged(mapping: "Mapping", number: int) -> bool:
+    """Tell whether write `number` (from 0) stays unreadable though nobody has overtaken it."""
+    words = mapping.words
+    deadline = monotonic() + PATIENCE
+    while (word := words[W_G]) - number < mapping.slots and not word >> 62 and read(mapping, number) is None:
+        if monotonic() > deadline:
+            return True
+        sleep(0.001)
+    return False
 
 
 def _sample(buffer: Any, at: int, length: int) -> Sample:

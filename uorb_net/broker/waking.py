@@ -34,13 +34,16 @@ class End:
         try:
             while len(os.read(self.fd, 65536)) == 65536:
                 pass
-        except BlockingIOError:
-            return
+        except OSError:
+            return  # empty, or closed with its directory while a thread slept on it
 
     def close(self) -> None:
-        """Give up the descriptors and the name."""
+        """Give up the descriptors and the name; a second call does nothing."""
+        if self.fd < 0:
+            return
         for fd in {self.fd, self.write_fd}:
             os.close(fd)
+        self.fd = self.write_fd = -1  # a sleeper that still knows this end must not touch who gets the number next
         if self.path:
             try:
                 os.unlink(self.path)
@@ -50,6 +53,8 @@ class End:
 
 class EndMaker(Protocol):
     """A directory, as far as a sleeper needs it."""
+
+    closed: bool
 
     def new_end(self) -> End:
         """Make a FIFO that publishers of this directory can find by its number."""
@@ -121,8 +126,14 @@ class Sleeper:
             end.drain()
         return True
 
+    def leave_closed(self) -> None:
+        """Close the ends in directories that were closed while a thread slept here."""
+        for directory in [directory for directory in self.ends if directory.closed]:
+            self.ends.pop(directory).close()
+
 
 _idle: list[Sleeper] = []
+_lent: list[Sleeper] = []  # every one ever lent, so also the idle
 
 
 def take() -> Sleeper:
@@ -130,7 +141,9 @@ def take() -> Sleeper:
     try:
         return _idle.pop()
     except IndexError:
-        return Sleeper()
+        sleeper = Sleeper()
+        _lent.append(sleeper)
+        return sleeper
 
 
 def give_back(sleeper: Sleeper) -> None:
@@ -138,15 +151,21 @@ def give_back(sleeper: Sleeper) -> None:
     _idle.append(sleeper)
 
 
-def forget_directory(directory: EndMaker) -> None:
-    """Drop the idle sleepers' ends in a directory that is being closed."""
+def forget_directory(directory: EndMaker) -> list[int]:
+    """Drop the idle sleepers' ends in a directory that is being closed.
+
+    Returns the numbers of the ends on which threads sleep. Closing those would take the wake-up back that
+    tells the threads; they close them when they find out (`leave_closed`).
+    """
     for sleeper in _idle:
         sleeper.forget(directory)
+    return [sleeper.ends[directory].number for sleeper in _lent if directory in sleeper.ends]
 
 
 def forget_all() -> None:
     """Drop every idle sleeper: a forked child must not touch its parent's."""
     _idle.clear()
+    _lent.clear()
 
 
 os.register_at_fork(after_in_child=forget_all)

@@ -24,6 +24,7 @@ VERBS = {
     "listener": "print samples of a topic",
     "pub": "publish a message given as JSON",
     "play": "play a ULog file onto the bus",
+    "test": "test the bus of this machine",
     "demo": "show a vehicle of two hosts on this machine",
 }
 EXAMPLES = """examples:

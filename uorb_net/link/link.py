@@ -338,10 +338,13 @@ class Link:
 
     def _on_ping(self, state: PeerState, message: control.Ping, now_us: int) -> None:
         self._say(state.peer, control.Pong(message.sent_us, now_us, hrt_absolute_time()))
+        if not state.measured:  # our own first ping may have come before the peer had seen us
+            self._say(state.peer, control.Ping(hrt_absolute_time()))
 
     def _on_pong(self, state: PeerState, message: control.Pong, now_us: int) -> None:
         if state.measure(message, now_us) and state.state == "connecting":
             self._state(state, "up")
+            self._mirrors.follow(self._offers.nodes)
 
     def _on_ask(self, state: PeerState, message: control.Ask, now_us: int) -> None:
         node = self._offers.nodes.get((message.topic, message.instance))

@@ -109,6 +109,8 @@ class Mirrors:
     def _demand(self, mirror: Mirror, interval_us: int | None) -> None:
         if interval_us == mirror.demand_us:
             return
+        if not mirror.state.measured and interval_us is not None:
+            return  # its first sample would have no time in this host's clock; `follow` comes again with it
         where = (mirror.peer, mirror.advert.topic, mirror.advert.instance)
         if interval_us is None:
             mirror.end()
