@@ -1,11 +1,11 @@
-"""Run all benchmarks, or those named: `python -m bench [codec node processes hosts]`."""
+"""Run all benchmarks, or those named: `python -m bench [codec node processes flow scale hosts]`."""
 
 import sys
 from importlib import import_module
 
 from bench.ratios import print_table
 
-ALL = ("codec", "node", "processes", "hosts")
+ALL = ("codec", "node", "processes", "flow", "scale", "hosts")
 
 
 def main() -> int:
