@@ -252,7 +252,7 @@ class Subscription(Generic[M]):
             unread = number >= self._position
             self._advance(number)
             if unread:
-                self._count_lost(number, 1)
+                self._count_lost(number + 1, 1)
             raise DecodeError(f"{self._node.name}: sample {number + 1} is damaged in the bus's memory")
 
     def update(self) -> M | None:

@@ -342,14 +342,9 @@ def test_a_process_stopped_with_the_directory_lock(shared: uorb.Broker, script: 
 
 def test_a_reader_is_not_held_up_by_the_directory_lock(shared: uorb.Broker, script: Start) -> None:
     """A dead publisher's topic reads as unadvertised even while someone sits on the directory lock."""
-    publisher, holder = script(PUBLISHER), script("with uorb.Broker()._directory.hold(): say('held'); hear()")
+    publisher = script(PUBLISHER)
     publisher.hear()
-    holder.hear()
     publisher.ask(1)
-    with pytest.raises(uorb.BusError), shared._directory.hold(0.0):
-        pass
-    holder.say("release")
-    holder.ends()
     subscription = shared.subscribe(OrbTest)
     holder = script("with uorb.Broker()._directory.hold(): say('held'); hear()")
     holder.hear()
@@ -399,9 +394,9 @@ while True:
     )
     subscription = shared.subscribe(OrbTestLarge)
     newest = 0
-    until = monotonic() + 1.5
     assert subscription.wait(20.0)
-    while monotonic() < until + 1.0:
+    until = monotonic() + 2.0
+    while monotonic() < until:
         message = subscription.update()
         if message is None:
             continue

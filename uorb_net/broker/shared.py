@@ -133,12 +133,16 @@ class SharedDirectory(Directory):
                 pause = min(pause * 2, 0.002)
         if not os.fstat(self._lock_fd).st_nlink:
             fcntl.flock(self._lock_fd, fcntl.LOCK_UN)
-            raise BusError(errno.ESTALE, f"{self.path} was removed under running processes: restart them all")
+            raise BusError(errno.ESTALE, self._removed())
         if self.me:
             self.bulletin[B_HOLDER] = self.me
 
+    def _removed(self) -> str:
+        return f"{self.path} was removed under running processes: restart them all"
+
     def _holder(self, wait: float) -> str:
-        holder = self.bulletin[B_HOLDER] if self.me else 0
+        with open(os.path.join(self.path, ".bus"), "rb") as file:  # this process may not have joined yet
+            holder = int.from_bytes(file.read(8 * B_HOLDER + 8)[8 * B_HOLDER :], "little")
         who = f"process {self.pid(holder)}" if holder else "another process"
         return f"{self.path}: {who} has held the directory lock for {wait:.0f} s; is it stopped? (kill -CONT)"
 
@@ -269,7 +273,10 @@ class SharedDirectory(Directory):
         return sorted(found)
 
     def lock_file(self, topic: str, instance: int, mapping: Mapping) -> int | None:
-        fd = more_descriptors(lambda: self._open(node_name(topic, instance), 0))
+        try:
+            fd = more_descriptors(lambda: self._open(node_name(topic, instance), 0))
+        except FileNotFoundError:
+            raise BusError(errno.ESTALE, self._removed()) from None
         if os.fstat(fd).st_ino != mapping.identity:
             os.close(fd)
             return None

@@ -45,9 +45,9 @@ class Refused(msgspec.Struct, frozen=True, array_like=True, tag="refused"):
 
 
 class Heads(msgspec.Struct, frozen=True, array_like=True, tag="heads"):
-    """Repeats the newest numbers sent to the receiver: topic, instance, sequence."""
+    """Repeats what the receiver's flows owe it: topic, instance, the number before the first, the newest sent."""
 
-    heads: list[tuple[str, int, int]]
+    heads: list[tuple[str, int, int, int]]
 
 
 class Gap(msgspec.Struct, frozen=True, array_like=True, tag="gap"):

@@ -35,7 +35,8 @@ class Mirror:
         self.node: Node | None = None
         self.origin = 0  # index of the host in the node's origin table
         self.demand_us: int | None = None  # the interval asked for; None: nobody here subscribes
-        self.base = True  # the next sample sets the base: nothing before it is loss
+        self.base = True  # the next sample or head sets the base: nothing before it is loss
+        self._assumed = 0  # the base as a first sample set it, until a head has told
         self.newest = 0  # highest sequence written
         self.waiting: dict[int, tuple[SampleHeader, bytes]] = {}
         self._asked = 0.0  # when the present gap was asked for; 0: none
@@ -63,9 +64,8 @@ class Mirror:
         if len(payload) != self.advert.payload_length or payload[:2] != b"\x00\x01":
             return False
         with self._lock:
-            if self.base and header.sequence != self.newest:
-                self.newest = header.sequence - 1
-            self.base = False
+            if self.base:
+                self._begin_at(header.sequence)
             if header.sequence <= self.newest:
                 return True  # a second copy, or the latched sample that is here already
             missing = header.sequence - self.newest - 1 - header.withheld
@@ -73,6 +73,13 @@ class Mirror:
                 self._take(header, payload)
                 self._release()
         return True
+
+    def _begin_at(self, sequence: int) -> None:
+        """Take a first sample for the first there was; a head may correct that."""
+        self.base = False
+        self._assumed = sequence - 1
+        if sequence != self.newest:  # else it is here already, from before the demand lapsed
+            self.newest = sequence - 1
 
     def _hold(self, header: SampleHeader, payload: bytes, ask: AskGap) -> bool:
         """Keep a sample while what is missing before it is asked for; False if it is not worth waiting."""
@@ -116,10 +123,16 @@ class Mirror:
                 self.newest = self._asked_last
             self._asked = 0.0
 
-    def head(self, sequence: int, ask: AskGap) -> None:
-        """Learn the newest number the sender has sent: a lost last sample shows here."""
+    def head(self, base: int, sequence: int, ask: AskGap) -> None:
+        """Learn what the sender owes: a lost first or last sample shows here."""
         with self._lock:
-            if self.base or sequence <= self.newest or self.waiting:
+            if self.base:
+                self.base = False
+                self.newest = max(self.newest, base)  # not twice what is here from before the demand lapsed
+            elif base < self._assumed:
+                self._count_lost(self._assumed - base)
+            self._assumed = 0
+            if sequence <= self.newest or self.waiting:
                 return
             if self.advert.queue_length > 1:
                 self._ask(sequence, ask)

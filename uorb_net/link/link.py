@@ -140,6 +140,11 @@ class Link:
         """Return the state of every host met, by name."""
         return [state.status() for _, state in sorted(self._peers.items())]
 
+    def subscribers(self, topic: str, instance: int = 0) -> list[str]:
+        """Return the hosts that subscribe to a topic instance of this host, as far as their wish has arrived."""
+        node = self._offers.nodes.get((topic, instance))
+        return [] if node is None else sorted(peer.host for peer in list(node.flows))
+
     def events(self) -> list[LinkEvent]:
         """Return the newest 1,000 events, oldest first."""
         return self._events.list()
@@ -368,10 +373,10 @@ class Link:
         self._events.add("definition", text, peer=state.peer.host, topic=message.topic)
 
     def _on_heads(self, state: PeerState, message: control.Heads, now_us: int) -> None:
-        for topic, instance, sequence in message.heads:
+        for topic, instance, base, sequence in message.heads:
             mirror = self._mirrors.all.get((state.peer, topic, instance))
             if mirror is not None and mirror.demand_us is not None:
-                mirror.head(sequence, self._ask_gap)
+                mirror.head(base, sequence, self._ask_gap)
 
     def _on_gap(self, state: PeerState, message: control.Gap, now_us: int) -> None:
         self._offers.resend(state.peer, message)

@@ -9,7 +9,7 @@ from time import monotonic
 from communicator import Advert, Channel, Peer, SampleHeader
 
 from ..broker.directory import Directory
-from ..broker.layout import GENERATION, MOVED, UNADVERTISED, W_FLOOR, W_G, Label
+from ..broker.layout import GENERATION, MOVED, UNADVERTISED, W_FLOOR, W_G, W_REMOTE, Label
 from ..broker.mapping import Mapping
 from ..broker.slots import Sample, read
 from ..broker.tables import shares, subscriber_entries
@@ -22,14 +22,15 @@ HEADS_FOR = 4.0  # seconds: longer than a cut that the default lease survives
 class Flow:
     """What one peer gets of one node."""
 
-    __slots__ = ("changed", "held", "interval_us", "last_us", "peer", "sequence")
+    __slots__ = ("base", "changed", "held", "interval_us", "last_us", "peer", "sequence")
 
-    def __init__(self, peer: Peer, interval_us: int) -> None:
+    def __init__(self, peer: Peer, interval_us: int, base: int) -> None:
         self.peer = peer
         self.interval_us = interval_us
         self.last_us = 0
-        self.sequence = 0  # of the newest sample sent; 0: none
-        self.changed = 0.0  # when that was (monotonic seconds), for how long to repeat it
+        self.base = base  # the publication before the first that this flow owes its peer
+        self.sequence = base  # the newest sent
+        self.changed = monotonic()  # when that changed, for how long to repeat it
         self.held = False  # a newer sample waits for the interval to pass
 
     def due(self, now_us: int) -> bool:
@@ -92,8 +93,9 @@ class LocalNode:
             return 0
         if not self.flows:
             self.position = self.mapping.words[W_G] & GENERATION
-        flow = self.flows[peer] = Flow(peer, interval_us)
         newest = self._newest()
+        base = self.position - self.mapping.words[W_REMOTE] if newest is None else newest.sequence - 1
+        flow = self.flows[peer] = Flow(peer, interval_us, base)
         if newest is None:
             return 0
         flow.passed(hrt_absolute_time())
@@ -147,7 +149,7 @@ class LocalNode:
     def _send(self, flow: Flow, sample: Sample, channel: Channel, latched: bool = False) -> int:
         if sample.sequence <= flow.sequence:
             return 0
-        withheld = sample.sequence - flow.sequence - 1 if flow.interval_us and flow.sequence else 0
+        withheld = sample.sequence - flow.sequence - 1 if flow.interval_us else 0
         flow.sequence = sample.sequence
         flow.changed = monotonic()
         age_us = max(hrt_absolute_time() - sample.published_us, 0)
@@ -173,7 +175,7 @@ class LocalNode:
 
     def changed_flows(self, now: float) -> list[Flow]:
         """Return the flows whose newest number is worth repeating (`now`: monotonic seconds)."""
-        return [flow for flow in self.flows.values() if flow.sequence and now - flow.changed < HEADS_FOR]
+        return [flow for flow in self.flows.values() if now - flow.changed < HEADS_FOR]
 
     def continue_from(self, old: "LocalNode") -> None:
         """Take over what the link knew of the node's former buffer."""
@@ -291,11 +293,11 @@ class Offers:
         due = [when for node in self._flowing if (when := node.next_due_us()) is not None]
         return (min(due) - hrt_absolute_time()) / 1e6 if due else None
 
-    def heads(self, now: float) -> dict[Peer, list[tuple[str, int, int]]]:
-        """Return the newest numbers worth repeating, by peer (`now`: monotonic seconds)."""
-        heads: dict[Peer, list[tuple[str, int, int]]] = {}
+    def heads(self, now: float) -> dict[Peer, list[tuple[str, int, int, int]]]:
+        """Return the numbers worth repeating, by peer (`now`: monotonic seconds): see `control.Heads`."""
+        heads: dict[Peer, list[tuple[str, int, int, int]]] = {}
         for node in self._flowing:
             for flow in node.changed_flows(now):
-                row = (node.label.topic, node.label.instance, flow.sequence)
+                row = (node.label.topic, node.label.instance, flow.base, flow.sequence)
                 heads.setdefault(flow.peer, []).append(row)
         return heads
