@@ -1,6 +1,7 @@
 """The limits: publishing processes, subscribing processes, sleepers, instances, descriptors, names, sizes."""
 
 import errno
+import resource
 from collections.abc import Callable
 from time import monotonic
 from typing import TYPE_CHECKING
@@ -137,37 +138,28 @@ def test_dead_sleepers_make_room(shared: uorb.Broker, script: Start) -> None:
     assert reader.hear() == "4"
 
 
-NODES = """
-import resource
-soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-if hard < 1000: say("skip"); sys.exit()
-resource.setrlimit(resource.RLIMIT_NOFILE, (64, {hard}))
-broker = uorb.Broker()
-for n in range(300):
-    name = "many_topic_%d" % n
-    cls = uorb.messages.from_text("ManyTopic", "uint64 timestamp\\nint32 val\\n")
-    pubs = globals().setdefault("pubs", [])
-    pubs.append(broker.advertise_instance(cls, name, 0))
-    pubs[-1].publish(cls(val=n))
-say("advertised", resource.getrlimit(resource.RLIMIT_NOFILE)[0] > 64)
-"""
-
-
 def test_three_hundred_nodes_raise_the_soft_limit(shared: uorb.Broker, script: Start) -> None:
     """A mapped node costs a descriptor: the soft limit goes up to the hard one, and all works."""
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    if hard < 1000:
+        pytest.skip(f"the hard limit of descriptors is {hard} here, 1000 are needed")
     many = script(
-        NODES.format(hard="hard")
-        + """
+        """
+hear()
+broker = uorb.Broker()
+cls = uorb.messages.from_text("ManyTopic", "uint64 timestamp\\nint32 val\\n")
+pubs = [broker.advertise_instance(cls, "many_topic_%d" % n, 0) for n in range(300)]
+for n, pub in enumerate(pubs): pub.publish(cls(val=n))
+say("advertised")
 subs = [broker.subscribe("many_topic_%d" % n) for n in range(300)]
 say(sum(sub.copy().val for sub in subs), len(uorb.poll([broker.subscribe("orb_test"), subs[0]], 0.01)))
 say(broker.exists("many_topic_299"), len(broker.topics()))
 hear()
 """
     )
-    answer = many.hear()
-    if answer == "skip":
-        pytest.skip("the hard limit of descriptors is too low here")
-    assert answer == "advertised True"
+    resource.prlimit(many.pid, resource.RLIMIT_NOFILE, (64, hard))
+    assert many.ask("go") == "advertised"
+    assert resource.prlimit(many.pid, resource.RLIMIT_NOFILE)[0] == hard
     assert many.hear() == f"{sum(range(300))} 0"
     assert many.hear() == "True 301"
     started = monotonic()
@@ -183,6 +175,7 @@ def test_at_the_hard_limit(shared: uorb.Broker, script: Start) -> None:
     few = script(
         """
 import resource
+types = msg.OrbTest, msg.OrbTestMedium, msg.OrbTestLarge
 broker = uorb.Broker()
 pub, sub = broker.advertise("orb_test"), broker.subscribe("orb_test")
 resource.setrlimit(resource.RLIMIT_NOFILE, (32, 32))
@@ -208,11 +201,13 @@ hear()
     assert few.hear() == "4 False"
 
 
-def test_the_soft_limit_met_while_waiting(shared: uorb.Broker, script: Start) -> None:
+@pytest.mark.parametrize("kind", ["shared", "private"])
+@pytest.mark.parametrize("how", ["wait", "fileno"])
+def test_the_soft_limit_met_while_waiting(script: Start, kind: str, how: str) -> None:
     """A wait that needs descriptors at the soft limit raises it, as opening nodes does."""
     waiting = script(
         """
-import resource
+import resource, uorb_net.exported
 broker = uorb.Broker()
 sub, pub = broker.subscribe("orb_test"), broker.advertise("orb_test")
 hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -224,9 +219,10 @@ if sys.argv[1] == "private": broker = uorb.Broker.private(); sub = broker.subscr
 say(sub.wait(0.01) if sys.argv[2] == "wait" else sub.fileno() > 0)
 hear()
 """,
-        *("shared", "wait"),
+        kind,
+        how,
     )
-    assert waiting.hear() == "False"
+    assert waiting.hear() == str(how == "fileno")
 
 
 def test_large_samples_and_long_queues(broker: uorb.Broker) -> None:

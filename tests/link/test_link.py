@@ -300,6 +300,68 @@ def test_the_clock_offset_is_measured(vehicle: Any, eventually: Until) -> None:
     assert abs(status.clock_offset) <= status.clock_uncertainty + 1e-4
 
 
+@pytest.mark.parametrize("seconds", [0.1, 0.6])
+@pytest.mark.parametrize("queue_length", [1, 16])
+def test_the_books_balance_across_a_cut(seconds: float, queue_length: int, eventually: Until) -> None:
+    """Shorter or longer than the lease: published = received + lost, with the newest sample there afterwards."""
+    network = MemoryNetwork(lease=0.3)
+    with uorb.Broker.private() as here, uorb.Broker.private() as there:
+        sender = uorb.Link(here, network.channel(), host="here").start()
+        receiver = uorb.Link(there, network.channel(), host="there").start()
+        publication = here.advertise(VehicleAttitude, attitude(0), queue_length=queue_length)
+        subscription = there.subscribe(VehicleAttitude)
+        assert subscription.wait(5.0)
+        network.cut("here", "there")
+        for number in range(1, 101):
+            publication.publish(attitude(number))
+        if seconds > 0.3:
+            assert eventually(lambda: receiver.peers()[0].state == "down")
+            assert eventually(lambda: sender.peers()[0].state == "down")
+        network.heal("here", "there")
+        assert receiver.wait_for_peer("here", 5.0)
+
+        def balanced() -> bool:
+            stats = receiver.stats()
+            return stats.received_samples + stats.lost == 101
+
+        assert eventually(balanced), receiver.stats()
+        assert receiver.stats().lost > 0
+        assert subscription.copy().timestamp_sample == 100 or queue_length > 1
+
+
+@pytest.mark.parametrize("queue_length", [1, 255])
+def test_the_books_balance_on_a_lossy_network(queue_length: int, eventually: Until) -> None:
+    """A fifth of all frames lost, some doubled and overtaken: a queue is complete, all is accounted for."""
+    network = MemoryNetwork(seed=3)
+    with uorb.Broker.private() as here, uorb.Broker.private() as there:
+        uorb.Link(here, network.channel(), host="here").start()
+        receiver = uorb.Link(there, network.channel(), host="there").start()
+        assert receiver.wait_for_peer("here", 5.0)
+        publication = here.advertise(VehicleAttitude, attitude(0), queue_length=queue_length)
+        subscription = there.subscribe(VehicleAttitude)
+        assert subscription.wait(5.0)
+        for pair in (("here", "there"), ("there", "here")):
+            network.set_link(*pair, loss=0.2, duplicate=0.1, reorder=0.1)
+        got = [subscription.copy().timestamp_sample]
+        for number in range(1, 301):
+            publication.publish(attitude(number))
+            if number % 10 == 0:
+                while subscription.wait(0.003):
+                    got.append(subscription.copy().timestamp_sample)
+
+        def balanced() -> bool:
+            while subscription.check():
+                got.append(subscription.copy().timestamp_sample)
+            stats = receiver.stats()
+            return stats.received_samples + stats.lost == 301
+
+        assert eventually(balanced, 15.0), receiver.stats()
+        assert got == sorted(set(got)), "a sample came twice or out of order"
+        assert len(got) + receiver.stats().lost + subscription.lost == 301
+        if queue_length > 1:
+            assert receiver.stats().retransmitted > 0
+
+
 def test_one_link_per_bus_and_kind_of_channel() -> None:
     """A second one is refused with the holder's process id; after stop the place is free."""
     network = MemoryNetwork()

@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 from threading import RLock
 from typing import TYPE_CHECKING
 
+from .descriptors import more_descriptors
 from .layout import MAGIC, SLEEPERS, W_G, W_HINT, W_MAGIC, W_SLEEPERS, Label, Shape, format_node, node_name
 from .mapping import Mapping
 from .tables import claim_sleeper, sleeper_entries
@@ -233,7 +234,7 @@ class PrivateDirectory(Directory):
     def new_end(self) -> End:
         with self._lock:
             self._count += 1
-            fd, write_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+            fd, write_fd = more_descriptors(lambda: os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC))
             end = self._ends[self._count] = End(self._count, fd, write_fd)
             self.fds[end.number] = write_fd
             return end

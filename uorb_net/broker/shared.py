@@ -9,21 +9,19 @@ import fcntl
 import mmap
 import os
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from struct import pack, unpack
 from tempfile import gettempdir
 from threading import RLock
 from time import monotonic, sleep
-from typing import TypeVar
 
 from ..errors import BusError, ClosedError
+from .descriptors import more_descriptors
 from .directory import B_END, B_HOLDER, B_PROCESS, BUS_SIZE, LOCK_WAIT, Directory, Filler
 from .layout import MAGIC, W_MAGIC, Label, Shape, format_node, node_name
 from .mapping import Mapping
 from .waking import End
-
-T = TypeVar("T")
 
 ALIVE_BASE = 1 << 32  # liveness locks start here; below it lie the pids
 F_OFD_GETLK, F_OFD_SETLK = 36, 37
@@ -38,22 +36,6 @@ def runtime_dir() -> str:
         return given
     base = "/dev/shm" if os.path.isdir("/dev/shm") else gettempdir()
     return os.path.join(base, f"uorb-{os.getuid()}")
-
-
-def more_descriptors(action: Callable[[], T]) -> T:
-    """Run `action`; where descriptors run out, raise the soft limit to the hard one and run it again."""
-    try:
-        return action()
-    except OSError as error:
-        if error.errno != errno.EMFILE:
-            raise
-        import resource
-
-        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-        if soft == hard:
-            raise
-        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-        return action()
 
 
 def checked_folder(path: str, forbidden: int) -> None:
@@ -86,10 +68,11 @@ class SharedDirectory(Directory):
         checked_folder(self.path, 0o077)
         self._threads = RLock()
         self._depth = 0
-        self._lock_fd = self._open(".lock")
-        self._alive_fd = self._open(".alive")
+        self._lock_fd = self._alive_fd = -1
         self.me = 0
         try:
+            self._lock_fd = more_descriptors(lambda: self._open(".lock"))
+            self._alive_fd = more_descriptors(lambda: self._open(".alive"))
             with self.hold():
                 self._settle()
         except BaseException:
@@ -151,7 +134,7 @@ class SharedDirectory(Directory):
     def _settle(self) -> None:
         """Open the folder's .bus, made or made anew where nobody lives; take a process number."""
         lonely = not self._anybody()
-        words = self._bus(self._open(".bus"))
+        words = self._bus(more_descriptors(lambda: self._open(".bus")))
         foreign = words[W_MAGIC] != MAGIC
         if foreign and not lonely:
             raise BusError(errno.EPROTO, self._foreign(words[W_MAGIC]))
@@ -173,7 +156,7 @@ class SharedDirectory(Directory):
         try:
             if os.fstat(fd).st_size < BUS_SIZE:
                 self._allocate(fd, BUS_SIZE, ".bus")
-            words = memoryview(mmap.mmap(fd, BUS_SIZE, flags=MAP_FLAGS)).cast("Q")
+            words = memoryview(more_descriptors(lambda: mmap.mmap(fd, BUS_SIZE, flags=MAP_FLAGS))).cast("Q")
         finally:
             os.close(fd)
         return words
@@ -187,12 +170,12 @@ class SharedDirectory(Directory):
 
     def _empty(self) -> None:
         """Remove all but the lock files of a bus on which nobody lives."""
-        for name in os.listdir(self.path):
+        for name in self._listed():
             if name not in (".lock", ".alive", ".bus"):
                 self._unlink(name)
 
     def sweep(self) -> None:
-        for name in os.listdir(self.path):
+        for name in self._listed():
             if name.endswith(".new") or (name.startswith(".w") and self._orphan(name)):
                 self._unlink(name)
 
@@ -266,7 +249,7 @@ class SharedDirectory(Directory):
 
     def names(self) -> list[tuple[str, int]]:
         found = []
-        for name in os.listdir(self.path):
+        for name in self._listed():
             topic, _, instance = name.partition(".")
             if topic and (not instance or instance.isdecimal()):
                 found.append((topic, int(instance or 0)))
@@ -306,6 +289,9 @@ class SharedDirectory(Directory):
                 f" {error.strerror}; give it more room, use a shorter queue, or set UORB_RUNTIME_DIR",
             ) from error
 
+    def _listed(self) -> list[str]:
+        return more_descriptors(lambda: os.listdir(self.path))
+
     def _unlink(self, name: str) -> None:
         try:
             os.unlink(os.path.join(self.path, name))
@@ -332,7 +318,7 @@ class SharedDirectory(Directory):
         path = os.path.join(self.path, f".w{number}")
         try:
             fd = more_descriptors(lambda: os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_CLOEXEC))
-        except OSError:
+        except (OSError, BusError):
             return False
         if len(self.fds) >= KEPT_ENDS:
             self._prune()
@@ -363,7 +349,8 @@ class SharedDirectory(Directory):
     def _close_descriptors(self) -> None:
         others = [fd for number, fd in self.fds.items() if number not in self._ends]
         for fd in [self._lock_fd, self._alive_fd, *others]:
-            os.close(fd)
+            if fd >= 0:
+                os.close(fd)
         self._lock_fd = self._alive_fd = -1
         self.fds.clear()
 

@@ -8,6 +8,8 @@ import os
 import select
 from typing import Protocol
 
+from .descriptors import more_descriptors
+
 DRAIN_EVERY = 16384  # wakes; a FIFO holds 64 KiB
 # Seconds that a sleep lasts before the next look. The first is above the tick of a 250 Hz kernel: a shorter one
 # makes each sleep program the timer hardware, which cost a quarter of a round trip on one CPU (measured).
@@ -78,7 +80,7 @@ class Sleeper:
 
     def __init__(self) -> None:
         self.ends: dict[EndMaker, End] = {}
-        self._epoll = select.epoll()
+        self._epoll = more_descriptors(select.epoll)
         self._poll = self._epoll.poll
         self._drain_every = DRAIN_EVERY  # wakes; 1 where the kernel gives no edges
         self._wakes = 0
@@ -114,7 +116,7 @@ class Sleeper:
 
         Linux 5.5 to 5.13 had kernels where it was not; there the sleeper reads after each wake.
         """
-        trial = select.epoll()
+        trial = more_descriptors(select.epoll)
         try:
             trial.register(end.fd, select.EPOLLIN | select.EPOLLET)
             for _ in range(2):

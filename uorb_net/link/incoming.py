@@ -36,6 +36,7 @@ class Mirror:
         self.origin = 0  # index of the host in the node's origin table
         self.demand_us: int | None = None  # the interval asked for; None: nobody here subscribes
         self.base = True  # the next sample or head sets the base: nothing before it is loss
+        self._resumed = False  # the base is where a cut ended the former mirror
         self._assumed = 0  # the base as a first sample set it, until a head has told
         self.newest = 0  # highest sequence written
         self.waiting: dict[int, tuple[SampleHeader, bytes]] = {}
@@ -141,13 +142,20 @@ class Mirror:
                 self.newest = sequence
 
     def begin(self) -> None:
-        """Somebody here subscribes (again): the next sample sets the base."""
+        """Somebody here subscribes (again): the next sample sets the base, unless the peer was only cut off."""
         with self._lock:
-            self.base = True
+            self.base = not self._resumed
+            self._resumed = False
+
+    def resume(self, newest: int) -> None:
+        """Go on counting where a cut ended the former mirror of this very stream."""
+        self.newest = newest
+        self._resumed = True
 
     def end(self) -> None:
         """Nobody here subscribes any more."""
         with self._lock:
+            self._resumed = False
             self.demand_us = None
             self.waiting.clear()
             self._asked = 0.0

@@ -41,6 +41,7 @@ class Mirrors:
         self._say = say
         self._types: dict[str, type[Message]] = {}  # by hash
         self._asked: dict[str, float] = {}  # by hash: when its definition was asked for last
+        self._cut: dict[Key, int] = {}  # newest numbers of streams that a cut ended under a living subscription
 
     # -- what peers announce -----------------------------------------------------------------------
 
@@ -52,6 +53,9 @@ class Mirrors:
             return
         self.drop(key)
         mirror = self.all[key] = Mirror(state, advert)
+        newest = self._cut.pop(key, None)
+        if newest is not None:
+            mirror.resume(newest)
         self._install(mirror)
 
     def drop(self, key: Key) -> None:
@@ -63,8 +67,16 @@ class Mirrors:
             self.thinned += mirror.thinned
 
     def drop_peer(self, peer: Peer) -> None:
-        """Forget all that a peer announced."""
+        """Forget all that a peer announced, but not how far its streams had come: it may only be cut off.
+
+        What it publishes meanwhile counts as lost for a living subscription of every sample. Of a limited
+        one nobody can tell what it would have got.
+        """
+        self._cut = {key: newest for key, newest in self._cut.items() if key[0].host != peer.host}
         for key in [key for key in self.all if key[0] == peer]:
+            mirror = self.all[key]
+            if mirror.demand_us == 0 and not mirror.base:
+                self._cut[key] = mirror.newest
             self.drop(key)
 
     def drop_all(self) -> None:
@@ -108,6 +120,8 @@ class Mirrors:
 
     def _demand(self, mirror: Mirror, interval_us: int | None) -> None:
         if interval_us == mirror.demand_us:
+            if interval_us is None:
+                mirror.end()  # the subscription that lived before a cut does not any more
             return
         if not mirror.state.measured and interval_us is not None:
             return  # its first sample would have no time in this host's clock; `follow` comes again with it
