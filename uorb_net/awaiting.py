@@ -1,9 +1,13 @@
 """Waiting for a subscription in an asyncio event loop: its descriptor, watched while somebody waits."""
 
 import asyncio
+import os
 from typing import TYPE_CHECKING, TypeVar
 
+from .broker.descriptors import more_descriptors
+
 if TYPE_CHECKING:
+    from .exported import Exported
     from .messages import Message
     from .subscription import Subscription
 
@@ -22,22 +26,33 @@ async def next_message(subscription: "Subscription[M]", timeout: float | None) -
         left = None if deadline is None else deadline - loop.time()
         if left is not None and left <= 0:
             return None
-        await _readable(loop, subscription.fileno(), left)
+        subscription.fileno()
+        assert subscription._exported is not None
+        await _readable(loop, subscription._exported, left)
         message = subscription.update()
         if message is not None:
             return message
 
 
-async def _readable(loop: asyncio.AbstractEventLoop, fd: int, seconds: float | None) -> None:
-    """Wait until a descriptor is readable, or time is up."""
+async def _readable(loop: asyncio.AbstractEventLoop, exported: "Exported", seconds: float | None) -> None:
+    """Wait until a descriptor is readable or closed, or time is up."""
     woken = loop.create_future()
 
     def wake() -> None:
         if not woken.done():
             woken.set_result(None)
 
+    # A copy: a loop has one reader per descriptor, and must not be left with one that was closed.
+    if exported.closed:
+        return
+    fd = more_descriptors(lambda: os.dup(exported.end.fd))
     loop.add_reader(fd, wake)
+    waiter = (loop, wake)
+    exported.waiting.add(waiter)
     try:
-        await asyncio.wait([woken], timeout=seconds)
+        if not exported.closed:  # by another thread, before it knew of this waiter
+            await asyncio.wait([woken], timeout=seconds)
     finally:
+        exported.waiting.discard(waiter)
         loop.remove_reader(fd)
+        os.close(fd)

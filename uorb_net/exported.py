@@ -6,12 +6,16 @@ timekeeper thread per process, started by the first descriptor and by nothing el
 """
 
 import os
+from collections.abc import Callable
+from contextlib import suppress
 from threading import Condition, Thread
 from typing import TYPE_CHECKING, Any
 
 from .errors import ClosedError, UorbError
 
 if TYPE_CHECKING:
+    from asyncio import AbstractEventLoop
+
     from .subscription import Subscription
 
 LOOK = 1.0  # seconds: how late a death, or a wake-up lost with its publisher, may show
@@ -24,6 +28,8 @@ class Exported:
         self._subscription = subscription
         self._directory = subscription._node.directory
         self.end = self._directory.new_end()
+        self.closed = False
+        self.waiting: set[tuple[AbstractEventLoop, Callable[[], None]]] = set()  # tasks, each with its waker
         self.settle()
         _timekeeper.add(self)
 
@@ -52,7 +58,11 @@ class Exported:
 
     def close(self) -> None:
         """Give the descriptor up."""
+        self.closed = True
         _timekeeper.remove(self)
+        for loop, wake in list(self.waiting):
+            with suppress(RuntimeError):  # a loop that has ended
+                loop.call_soon_threadsafe(wake)
         self._directory.drop_end(self.end)
 
 

@@ -85,6 +85,7 @@ os.read(ready, 1)
 say(broker.topics()[0].publishers)
 pub.publish(msg.OrbTest(val=3))
 say(os.wait()[1])
+hear()
 """
     )
     assert parent.hear() == "2"

@@ -48,10 +48,10 @@ def test_a_node_of_subscribers_only_is_free(broker: uorb.Broker) -> None:
     subscription = broker.subscribe(TOPIC, 0)
     assert not broker.exists(TOPIC)
     assert broker.group_count(TOPIC) == 0
-    assert not subscription.advertised
+    found = [subscription.advertised]
     publication = broker.advertise_multi(TOPIC)
     assert publication.instance == 0
-    assert subscription.advertised
+    assert [*found, subscription.advertised] == [False, True]
     publication.publish(OrbTest(val=1))
     assert subscription.copy().val == 1
 

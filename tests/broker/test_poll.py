@@ -2,6 +2,7 @@
 
 import resource
 from collections.abc import Callable
+from functools import partial
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
@@ -125,19 +126,21 @@ def test_a_wait_before_anyone_advertises(broker: uorb.Broker, in_thread: InThrea
     assert subscription.copy().val == 4
 
 
+WAYS: dict[str, Callable[[uorb.Subscription[Any]], object]] = {
+    "wait": lambda subscription: subscription.wait(20.0),
+    "poll": lambda subscription: uorb.poll([subscription], 20.0),
+    "iteration": lambda subscription: next(iter(subscription)),
+}
+
+
 @pytest.mark.parametrize("what", ["subscription", "broker"])
-@pytest.mark.parametrize("which", ["wait", "poll", "iteration"])
+@pytest.mark.parametrize("which", WAYS)
 def test_closing_ends_the_waits(what: str, which: str, in_thread: InThread, runtime_dir: object) -> None:
     """A close in another thread ends a wait with ClosedError, at once."""
     with uorb.Broker() as broker, uorb.Broker.private() as second:
         for bus in (broker, second):
             subscription = bus.subscribe(OrbTest)
-            waits: dict[str, Callable[[], object]] = {
-                "wait": lambda s=subscription: s.wait(20.0),
-                "poll": lambda s=subscription: uorb.poll([s], 20.0),
-                "iteration": lambda s=subscription: next(iter(s)),
-            }
-            task = in_thread(waits[which])
+            task = in_thread(partial(WAYS[which], subscription))
             task.thread.join(0.25)
             assert not task.done()
             started = monotonic()

@@ -3,6 +3,7 @@
 import os
 import signal
 from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING
@@ -192,8 +193,6 @@ say("done"); hear()
 
 def test_processes_publish_together(shared: uorb.Broker, script: Start) -> None:
     """G is the sum of all publications, every sample whole, no number twice, each publisher's in its order."""
-    from hashlib import sha256
-
     count, writers = 3000, 3
     keeper = shared.advertise("orb_test_medium", queue_length=255)
     subscription = shared.subscribe("orb_test_medium")

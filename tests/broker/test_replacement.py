@@ -178,7 +178,9 @@ def test_a_mover_killed_in_the_act(
     assert monotonic() - started < 1.3
     assert subscription.copy().val == 3
     assert not publication._node.mapping.words[W_G] & MOVED
-    reader = script("sub = uorb.Broker().subscribe('orb_test'); say(sub.copy().val); hear(); say(sub.copy().val); hear()")
+    reader = script(
+        "sub = uorb.Broker().subscribe('orb_test'); say(sub.copy().val); hear(); say(sub.copy().val); hear()"
+    )
     assert reader.hear() == "3"
     publication.publish(OrbTest(val=4))
     assert reader.ask("go") == "4"

@@ -34,7 +34,7 @@ def test_topics_lists_every_node(broker: uorb.Broker) -> None:
     assert broker.topics() == []
     publication = broker.advertise_multi("orb_multitest", OrbTest(), priority=100, queue_length=3)
     others = [broker.advertise_multi("orb_multitest") for _ in range(10 - 1)]
-    readers = [broker.subscribe("orb_multitest", 9), broker.subscribe(SensorAccel), broker.subscribe(SensorAccel)]
+    readers: list[Any] = [broker.subscribe("orb_multitest", 9), *(broker.subscribe(SensorAccel) for _ in range(2))]
     statuses = broker.topics()
     keys = [(status.topic, status.instance) for status in statuses]
     assert keys == [*(("orb_multitest", n) for n in range(10)), ("sensor_accel", 0)]
@@ -57,7 +57,8 @@ def test_topics_lists_every_node(broker: uorb.Broker) -> None:
     assert statuses[9].subscribers == 1
     with pytest.raises(AttributeError):
         first.lost = 1  # type: ignore[misc]
-    for user in [publication, *others, *readers]:
+    users: list[Any] = [publication, *others, *readers]
+    for user in users:
         user.close()
     assert not any(s.advertised or s.publishers or s.subscribers for s in broker.topics())
 
@@ -144,7 +145,7 @@ def test_another_definition_is_refused_naming_the_field(
         assert str(os.getpid()) in str(caught.value)
     used.close()
     publication = broker.advertise(theirs)
-    publication.publish(theirs(q=(1, 2, 3, 4)))  # type: ignore[call-arg]
+    publication.publish(theirs(q=(1, 2, 3, 4)))
     assert broker.subscribe(theirs).copy().q == (1, 2, 3, 4)  # type: ignore[attr-defined]
     assert [status.type_hash for status in broker.topics()] == [theirs.__uorb__.type_hash]
 
@@ -158,7 +159,7 @@ def test_a_definition_that_only_the_node_knows(
         broker.subscribe("strange_topic")
     with pytest.raises(uorb.UnknownTopicError):
         broker.exists("strange_topic")
-    broker.advertise(mine, mine(q=(1, 2, 3, 4)))  # type: ignore[call-arg]
+    broker.advertise(mine, mine(q=(1, 2, 3, 4)))
     assert broker.exists("strange_topic")
     assert broker.group_count("strange_topic") == 1
     assert broker.subscribe("strange_topic").copy().q == (1, 2, 3, 4)
@@ -170,7 +171,7 @@ def test_a_definition_from_another_process(
 ) -> None:
     """The text travels in the node: no definition is needed where the topic is read."""
     mine, theirs = foreign
-    shared.advertise(mine, mine(q=(4, 3, 2, 1)))  # type: ignore[call-arg]
+    shared.advertise(mine, mine(q=(4, 3, 2, 1)))
     reader = script(
         """
 broker = uorb.Broker()

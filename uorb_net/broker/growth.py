@@ -16,7 +16,7 @@ from .layout import (
     UNADVERTISED,
     W_FLOOR,
     W_G,
-    W_LAPSED,
+    W_NETLOST,
     W_REMOTE,
     W_SHARED,
     Label,
@@ -38,7 +38,7 @@ class _Copy:
         old, words = self.old, mapping.words
         state = old.words[W_G] & ~MOVED
         words[W_REMOTE] = old.words[W_REMOTE]
-        for index in range(W_FLOOR, W_LAPSED + 1):
+        for index in range(W_FLOOR, W_NETLOST + 1):
             words[index] = old.words[index]
         tables = slice(8 * PUBLISHERS, LABEL_OFFSET)
         mapping.buffer[tables] = old.buffer[tables]

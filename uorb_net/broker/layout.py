@@ -37,6 +37,7 @@ W_LOST: Final = 34  # lost by subscriptions that are gone
 W_ORIGINS: Final = 35  # how many hosts the origin table holds
 W_SLEEPERS: Final = 36  # entries of the sleeper table ever used: publishers scan no further
 W_LAPSED: Final = 37  # generation at which a mirror's demand ended: nothing before it is an update
+W_NETLOST: Final = 38  # what the link has counted as lost on the way to this node
 
 # -- tables ---------------------------------------------------------------------------------------
 PUBLISHERS: Final = 64  # word index; 32 entries of 2 words: process number; packed share

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import BusyError, ClosedError
 from .directory import Directory, wake
-from .layout import GENERATION, MOVED, UNADVERTISED, W_BUSY, W_G, W_HINT, W_REMOTE, W_SHARED, Label
+from .layout import GENERATION, MOVED, UNADVERTISED, W_BUSY, W_G, W_HINT, W_NETLOST, W_REMOTE, W_SHARED, Label
 from .mapping import Mapping
 from .tables import release_sleeper, shares, sleeper_entries
 
@@ -310,6 +310,11 @@ class Node:
         with self._lock:
             if self.subscriber:
                 self.mapping.words[self.subscriber + 3] += count
+
+    def count_network_lost(self, count: int) -> None:
+        """Add to what the link lost on the way to this node; only the link's process writes the word."""
+        with self._lock:
+            self.mapping.words[W_NETLOST] += count
 
     def forget_sleepers(self, numbers: list[int]) -> None:
         """Free the entries of this process's FIFOs (under the directory lock)."""

@@ -3,7 +3,7 @@
 import msgspec
 
 from .directory import Directory
-from .layout import GENERATION, MOVED, UNADVERTISED, W_FLOOR, W_G, W_PRIORITY, Label
+from .layout import GENERATION, MOVED, UNADVERTISED, W_FLOOR, W_G, W_NETLOST, W_PRIORITY, Label
 from .mapping import Mapping
 from .slots import read
 from .tables import shares, subscriber_entries, total_lost
@@ -32,11 +32,15 @@ class TopicStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Survey(msgspec.Struct, frozen=True):
-    """A node's status with what only tools ask: encoded bytes, µs of the last write (0: never), its text."""
+    """A node's status with what only tools ask.
+
+    `size`: encoded bytes; `received_us`: of the last write, 0 for never; `link_lost`: lost on the network.
+    """
 
     status: TopicStatus
     size: int
     received_us: int
+    link_lost: int
     label: Label
 
 
@@ -85,7 +89,7 @@ def _look(directory: Directory, mapping: Mapping, living: set[int]) -> Survey:
         priority=words[W_PRIORITY],
         origin=mapping.origin(origin) or directory.host,
     )
-    return Survey(status, mapping.length, last_write(mapping), label)
+    return Survey(status, mapping.length, last_write(mapping), words[W_NETLOST], label)
 
 
 def last_write(mapping: Mapping) -> int:

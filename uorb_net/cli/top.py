@@ -34,11 +34,10 @@ Key = tuple[str, int]
 
 
 class Look(msgspec.Struct, frozen=True):
-    """All nodes at one moment: seconds, surveys and network losses by topic and instance."""
+    """All nodes at one moment: seconds, and surveys by topic and instance."""
 
     at: float
     nodes: Mapping[Key, Survey]
-    link_lost: Mapping[Key, int]
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
@@ -110,20 +109,12 @@ def look(bus: Bus, filters: Sequence[str] = ()) -> Look:
         for node in bus.broker.survey()
         if wanted(node.status.topic, filters)
     }
-    return Look(monotonic(), nodes, _link_lost(bus, nodes))
+    return Look(monotonic(), nodes)
 
 
 def wanted(topic: str, filters: Sequence[str]) -> bool:
     """Tell whether a name holds, or as a pattern matches, one of the filters; without any it does."""
     return not filters or any(text in topic or fnmatch.fnmatchcase(topic, text) for text in filters)
-
-
-def _link_lost(bus: Bus, nodes: Mapping[Key, Survey]) -> dict[Key, int]:
-    """Return what this process's own link lost; a link elsewhere does not tell yet."""
-    if bus.link is None:
-        return {}
-    lost = {(s.topic, s.instance, s.origin): s.lost for s in bus.link.topic_stats()}
-    return {key: lost.get((*key, node.status.origin), 0) for key, node in nodes.items()}
 
 
 def compare(before: Look, now: Look) -> list[tuple[Row, Losses]]:
@@ -138,7 +129,6 @@ def compare(before: Look, now: Look) -> list[tuple[Row, Losses]]:
         fresh = old is None or old.status.generation > status.generation
         writes = status.generation - (0 if old is None or fresh else old.status.generation)
         lost = status.lost - (0 if old is None or fresh else old.status.lost)
-        link_lost = now.link_lost.get(key, 0)
         row = Row(
             name=status.topic,
             instance=status.instance,
@@ -149,9 +139,9 @@ def compare(before: Look, now: Look) -> list[tuple[Row, Losses]]:
             size=node.size,
             origin=status.origin,
             age=max(moment - node.received_us, 0) / 1e6 if node.received_us else None,
-            link_lost=link_lost,
+            link_lost=node.link_lost,
         )
-        link_losses = max(link_lost - before.link_lost.get(key, 0), 0)
+        link_losses = node.link_lost - (0 if old is None or fresh else old.link_lost)
         found.append((row, Losses(max(lost, 0) / seconds, link_losses / seconds)))
     return found
 

@@ -190,8 +190,13 @@ class Mirror:
             self.state.received += 1
 
     def _count_lost(self, count: int) -> None:
+        if not count:
+            return
         self.lost += count
         self.state.lost += count
+        node = self.node
+        if node is not None:
+            node.count_network_lost(count)
 
     def stats(self) -> TopicLinkStats:
         """Return the totals."""
