@@ -34,7 +34,7 @@ def options(
         "udp/10.0.0.1:1",
         "tcp/0.0.0.0:65535#so_sndbuf=65536",
         "tcp/10.0.0.1:7447?rel=0;prio=1-3",
-        "unixsock-stream//tmp/uorb.sock",
+        "unixsock-stream//run/uorb.sock",
         "ws/host:80",
     ],
 )

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable
 from threading import Condition, Thread
 from time import monotonic
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import msgspec
 
@@ -29,9 +29,6 @@ from .mirrors import Mirrors
 from .outgoing import Offers
 from .peers import PeerState
 from .status import LinkEvent, LinkStats, PeerStatus, TopicLinkStats
-
-if TYPE_CHECKING:
-    pass
 
 TICK = 0.2  # seconds between heads, and between looks at who died
 PING_EVERY = 0.5  # seconds
