@@ -101,10 +101,13 @@ def test_a_child_does_not_keep_its_dead_parent_alive(shared: uorb.Broker, script
         + """
 brokers = [uorb.Broker(), uorb.Broker()]
 pub = brokers[0].advertise("orb_test", msg.OrbTest(val=1))
+read, write = os.pipe()
 pid = os.fork()
 if not pid:
+    os.write(write, b"lives")
     time.sleep(60)
     os._exit(0)
+os.read(read, 5)
 say(pid); hear()
 """
     )
@@ -128,10 +131,13 @@ def test_a_child_does_not_keep_its_dead_parents_write_lock(shared: uorb.Broker, 
         + """
 pub = uorb.Broker().advertise("orb_test")
 pub.publish(msg.OrbTest(val=1))
+read, write = os.pipe()
 pid = os.fork()
 if not pid:
+    os.write(write, b"lives")
     time.sleep(60)
     os._exit(0)
+os.read(read, 5)
 mapping = pub._node.mapping
 mapping.pack = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 say(pid); hear()

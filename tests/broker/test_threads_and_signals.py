@@ -56,11 +56,14 @@ broker = uorb.Broker(){private}
 keeper = {keeper}
 pub = broker.advertise("orb_test", queue_length=255)
 sub = broker.subscribe("orb_test")
-handled = 0
+handled, inside = 0, False
 def handler(*_):
-    global handled
+    global handled, inside
+    if inside: return  # it was interrupted by the next signal, and would number its own samples twice
+    inside = True
     handled += 1
     pub.publish(msg.OrbTest(timestamp=2, val=handled))
+    inside = False
 signal.signal(signal.SIGALRM, handler)
 signal.setitimer(signal.ITIMER_REAL, 0.001, 0.001)
 seen = {{1: [], 2: []}}
