@@ -49,7 +49,7 @@ class Near:
 
         self.child = child
         self.queue = broker.advertise(SensorCombined, queue_length=255)
-        self.image = broker.advertise(IMAGE)
+        self.image = broker.advertise(IMAGE, queue_length=8)
         self.acknowledged = broker.subscribe(OrbTest)
         self.push: Any = zmq.Context.instance().socket(zmq.PUSH)
         self.push.set_hwm(WINDOW // 2)

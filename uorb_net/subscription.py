@@ -199,7 +199,8 @@ class Subscription(Generic[M]):
             return False
         if self._interval and monotonic() - self._last < self._interval:
             return False
-        return self._node.publishing > 0 or self._published()
+        node = self._node
+        return node.publishing > 0 or monotonic() - node.checked < DEATH_CHECK or self._published()
 
     def _pass_latched(self, word: int) -> bool:
         """Step over latched samples that were published before this subscription; True if another is unread.
@@ -223,18 +224,22 @@ class Subscription(Generic[M]):
             ClosedError: the subscription is closed.
             DecodeError: the sample's bytes were damaged, by whatever writes to foreign memory; it counts as lost.
         """
+        node = self._node
         while True:
             number = self._choose()
-            generation, cached = self._node.cache
-            if generation == number + 1:
+            generation, message = node.cache
+            if generation != number + 1:
+                message = cast("Message | None", decoded(self._mapping, number, self._decode))
+                if message is None:
+                    self._failed(number)
+                    continue
+                node.cache = (number + 1, message)
+            if number == self._position and not self._interval and self._exported is None:
+                self._position = self._quiet = number + 1  # `_advance` in the commonest case, without the call
+                self._last = monotonic()
+            else:
                 self._advance(number)
-                return cast(M, cached)
-            message = decoded(self._mapping, number, self._decode)
-            if message is not None:
-                self._node.cache = (number + 1, cast("Message", message))
-                self._advance(number)
-                return message
-            self._failed(number)
+            return cast(M, message)
 
     def copy_with_info(self) -> Sample[M]:
         """Return what `copy` does, with its `SampleInfo`; raises as `copy`."""
@@ -276,7 +281,8 @@ class Subscription(Generic[M]):
         floor = words[W_FLOOR]
         if word <= floor:
             raise NoDataError(f"nothing was published on {self._node.name}")
-        if not (self._node.publishing or self._published()):
+        node = self._node
+        if not node.publishing and monotonic() - node.checked >= DEATH_CHECK and not self._published():
             raise NoDataError(f"the publisher of {self._node.name} is gone")
         length = self._mapping.queue_length
         if length == 1 or self._position >= word or self._interval:

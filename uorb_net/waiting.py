@@ -66,6 +66,7 @@ def wait_for_one(subscription: "Subscription[Any]", timeout: float | None) -> bo
     if timeout is not None and timeout <= 0:
         return False
     deadline = 0.0 if timeout is None else monotonic() + timeout
+    left = timeout
     sleeper = take()
     look = 0
     try:
@@ -76,20 +77,21 @@ def wait_for_one(subscription: "Subscription[Any]", timeout: float | None) -> bo
             if subscription.check():
                 return True
             seconds = LOOKS[look] if armed else CROWDED
-            due = subscription.due_in()
-            if due is not None and due < seconds:
-                seconds = due
-            if deadline:
-                left = deadline - monotonic()
-                if left <= 0:
-                    return False
-                seconds = min(seconds, left)
+            if subscription._interval:
+                due = subscription.due_in()
+                seconds = seconds if due is None else min(seconds, due)
+            if left is not None and left < seconds:
+                seconds = left
             if sleeper.sleep(seconds):
                 look = 0
             elif look < len(LOOKS) - 1:
                 look += 1
             if subscription.check():
                 return True
+            if deadline:
+                left = deadline - monotonic()
+                if left <= 0:
+                    return False
     except ClosedError:
         sleeper.leave_closed()
         raise
