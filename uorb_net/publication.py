@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar, cast
 
 from .broker import members
 from .broker.layout import MOVED, W_G
-from .errors import ClosedError, TopicMismatchError
+from .errors import BusError, ClosedError, TopicMismatchError
 
 if TYPE_CHECKING:
     from .broker.node import Node
@@ -18,7 +18,7 @@ M = TypeVar("M", bound="Message")
 class Publication(Generic[M]):
     """A publisher of one topic instance. Made by `Broker.advertise`; lives until unadvertised."""
 
-    __slots__ = ("_class", "_closed_by", "_encode", "_node", "_priority", "_write")
+    __slots__ = ("_class", "_closed_by", "_encode", "_left", "_node", "_priority", "_write")
 
     def __init__(self, node: "Node", priority: int, on_close: Callable[["Publication[Any]"], None]) -> None:
         self._node = node
@@ -27,6 +27,7 @@ class Publication(Generic[M]):
         self._encode = node.type.encode
         self._write: Callable[[bytes, int, int], None] = node.write
         self._closed_by = on_close
+        self._left = False
 
     @property
     def topic(self) -> str:
@@ -91,17 +92,26 @@ class Publication(Generic[M]):
         return cast(M, message)
 
     def unadvertise(self) -> None:
-        """Stop publishing; the topic stays advertised while any publisher of it remains."""
-        if self._encode is _spent:
+        """Stop publishing; the topic stays advertised while any publisher of it remains.
+
+        Raises:
+            BusError: the bus cannot be told now; this publishes no more, a second call tries again.
+        """
+        if self._left:
             return
         self.spend()
-        members.unadvertise(self._node)
+        try:
+            members.unadvertise(self._node)
+        except BusError:
+            self._left = False
+            raise
         self._closed_by(self)
 
     close = unadvertise
 
     def spend(self) -> None:
         """Make every later publish raise ClosedError."""
+        self._left = True
         self._encode = _spent
         self._write = _spent
 

@@ -339,6 +339,27 @@ def test_a_process_stopped_with_the_directory_lock(shared: uorb.Broker, script: 
     shared.advertise(OrbTest)
 
 
+def test_unadvertising_while_the_bus_cannot_be_told(
+    shared: uorb.Broker, script: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the directory lock held by a stopped process it is BusError; a second call tries again."""
+    publication = shared.advertise(OrbTest)
+    hold = shared._directory.hold
+    monkeypatch.setattr(shared._directory, "hold", lambda wait=0.05: hold(min(wait, 0.05)))
+    holder = script("with uorb.Broker()._directory.hold(): say('held'); hear()")
+    holder.hear()
+    for _ in range(2):
+        with pytest.raises(uorb.BusError, match=str(holder.pid)):
+            publication.unadvertise()
+        with pytest.raises(uorb.ClosedError):
+            publication.publish(OrbTest())
+        assert shared.exists(OrbTest)
+    holder.kill()
+    publication.unadvertise()
+    assert not shared.exists(OrbTest)
+    publication.unadvertise()
+
+
 def test_a_reader_is_not_held_up_by_the_directory_lock(shared: uorb.Broker, script: Start) -> None:
     """A dead publisher's topic reads as unadvertised even while someone sits on the directory lock."""
     publisher = script(PUBLISHER)

@@ -1,5 +1,6 @@
 """A node's file replaced under running processes: nothing lost, nobody stuck, whenever the mover is killed."""
 
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from time import monotonic
@@ -293,12 +294,15 @@ pub.publish(msg.OrbTest(val=1)); say("published"); hear()
     subscription = shared.subscribe(OrbTest)
     other.say("go")
     other.await_stop()
-    with pytest.raises(uorb.BusyError):
-        shared.advertise(OrbTest, queue_length=30)
-    other.signal(18)
+    for publishers in (1, 2):  # alone, and among others who have not written yet
+        with pytest.raises(uorb.BusyError):
+            shared.advertise(OrbTest, queue_length=30)
+        assert shared.topics()[0].publishers == publishers
+        shared.advertise(OrbTest)
+    other.signal(signal.SIGCONT)
     assert other.hear() == "published"
     assert subscription.copy().val == 1
-    assert shared.topics()[0].publishers == 1
+    assert shared.topics()[0].publishers == 3
     assert shared.advertise(OrbTest, queue_length=30).queue_length == 1
 
 

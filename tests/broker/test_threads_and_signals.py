@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import uorb_net as uorb
+from uorb_net.broker.shared import process_directory
 from uorb_net.msg import OrbTest, OrbTestMedium
 
 if TYPE_CHECKING:
@@ -182,6 +183,24 @@ def test_close_while_another_thread_reads(broker: uorb.Broker, in_thread: InThre
         with pytest.raises(uorb.ClosedError):
             subscription.check()
     assert broker.topics()[0].subscribers == 0
+
+
+def test_a_broker_opened_while_the_last_other_one_closes(
+    runtime_dir: object, monkeypatch: pytest.MonkeyPatch, in_thread: InThread
+) -> None:
+    """The folder is not closed under a broker that has just been opened on it."""
+    first = uorb.Broker()
+
+    def while_closing(vehicle: str) -> Any:
+        directory = process_directory(vehicle)
+        in_thread(first.close).thread.join(0.2)
+        return directory
+
+    monkeypatch.setattr("uorb_net.broker.broker.process_directory", while_closing)
+    with uorb.Broker() as second:
+        assert second.topics() == []
+        second.advertise(OrbTest, OrbTest(val=1))
+        assert second.subscribe(OrbTest).copy().val == 1
 
 
 CLOSES = """

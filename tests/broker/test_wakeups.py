@@ -98,10 +98,16 @@ pub.publish(msg.OrbTest(val=7))
     del keeper
 
 
-def test_a_wake_up_races_with_arming(shared: uorb.Broker, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("how", ["wait", "poll"])
+def test_a_wake_up_races_with_arming(shared: uorb.Broker, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
     """A publication at any step of a sleeper's arming is found at once, or wakes it."""
+    quiet = shared.subscribe("orb_test_medium")
     publication = shared.advertise(OrbTest)
     subscription = shared.subscribe(OrbTest)
+
+    def wait() -> object:
+        return subscription.wait(5.0) if how == "wait" else uorb.poll([subscription, quiet], 5.0)
+
     directory = type(shared._directory)
     arm, sleep = directory.arm, Sleeper.sleep
     looks: list[bool] = []
@@ -122,7 +128,7 @@ def test_a_wake_up_races_with_arming(shared: uorb.Broker, monkeypatch: pytest.Mo
     monkeypatch.setattr(Sleeper, "sleep", counting)
     for racing in (before, after):
         monkeypatch.setattr(directory, "arm", racing)
-        assert subscription.wait(5.0)
+        assert wait()
         subscription.copy()
     assert looks == []  # never slept
 
@@ -133,7 +139,7 @@ def test_a_wake_up_races_with_arming(shared: uorb.Broker, monkeypatch: pytest.Mo
     monkeypatch.setattr(directory, "arm", arm)
     monkeypatch.setattr(Sleeper, "sleep", in_between)
     for _ in range(100):
-        assert subscription.wait(5.0)
+        assert wait()
         subscription.copy()
     assert looks == [True] * 100
 

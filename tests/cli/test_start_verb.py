@@ -215,3 +215,15 @@ def test_start_logs_a_line_per_change(shell: Any, far: Any, endpoint: str) -> No
     assert "peer: ground is down" in process.stderr.readline()
     process.terminate()
     assert "stopping" in process.stderr.readline()
+
+
+def test_an_unreachable_endpoint_is_one_line(shell: Any, endpoint: str) -> None:
+    """It is named, once, and the link goes on trying."""
+    process = shell.spawn("start", "--connect", endpoint, "--host", "lonely")
+    assert "connects to" in process.stderr.readline()
+    line = process.stderr.readline()
+    assert "no host reached yet" in line
+    assert endpoint in line
+    process.terminate()
+    assert "is stopping" in process.stderr.readline()
+    assert process.wait(5) == 0

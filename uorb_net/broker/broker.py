@@ -10,7 +10,7 @@ from ..errors import BusError, ClosedError, InstanceError, QueueLengthError, Unk
 from . import members
 from .directory import Directory, PrivateDirectory
 from .layout import is_topic
-from .shared import process_directory
+from .shared import opening, process_directory
 from .survey import Survey, TopicStatus, survey
 
 if TYPE_CHECKING:
@@ -51,7 +51,8 @@ class Broker:
         if name.startswith(".") or not all(c.isalnum() or c in "_-." for c in name) or len(name) > 64:
             raise ValueError(f"vehicle = {name!r}: letters, digits, _ . - only, at most 64, not starting with a dot")
         self.vehicle = name
-        self._open(process_directory(name))
+        with opening:  # or the last other broker of the folder closes it before this one counts
+            self._open(process_directory(name))
 
     def _open(self, directory: Directory) -> None:
         self._directory = directory
@@ -356,9 +357,10 @@ class Broker:
             with suppress(BusError):  # the folder was removed: nothing left to leave
                 user.close()
         self._closed = True
-        _brokers.discard(self)
-        if not any(broker._directory is self._directory for broker in _brokers):
-            self._directory.close()
+        with opening:
+            _brokers.discard(self)
+            if not any(broker._directory is self._directory for broker in _brokers):
+                self._directory.close()
 
     def spend(self) -> None:
         """Make every later call on this broker and what it opened raise ClosedError."""

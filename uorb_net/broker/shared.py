@@ -369,12 +369,12 @@ class SharedDirectory(Directory):
 def process_directory(vehicle: str) -> SharedDirectory:
     """Return this process's directory of `vehicle`'s bus, opened when first asked for."""
     runtime = os.path.abspath(runtime_dir())
-    with _opening:
+    with opening:
         directory = _open.get((runtime, vehicle))
         if directory is None or directory.closed:
             directory = _open[runtime, vehicle] = SharedDirectory(runtime, vehicle)
         return directory
 
 
-_opening = RLock()
+opening = RLock()  # held while a process's directory is opened or closed
 _open: dict[tuple[str, str], SharedDirectory] = {}

@@ -3,6 +3,7 @@
 import argparse
 import logging
 import time
+from collections.abc import Sequence
 
 from ..link import Link
 from .carried import make_link, open_broker
@@ -11,6 +12,7 @@ from .options import Parser, add_common
 from .settings import settings
 
 NAP = 1.0  # seconds between two looks whether the link lives
+LONELY = 3.0  # seconds without any peer before an operator is told
 log = logging.getLogger("uorb_net.start")
 
 
@@ -35,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
         log.info("%s of vehicle %s %s (bus %s)", link.host, link.vehicle, chosen.endpoints, broker.path)
         try:
             notifier.send("READY=1")
-            return _watch(link, notifier)
+            return _watch(link, notifier, chosen.connect)
         finally:
             log.info("%s is stopping", link.host)
             notifier.send("STOPPING=1")
@@ -46,10 +48,13 @@ def _configure_logging() -> None:
     logging.getLogger("uorb_net").setLevel(logging.INFO)
 
 
-def _watch(link: Link, notifier: Notifier) -> int:
-    thread = link._thread
-    while thread is not None and thread.is_alive():
+def _watch(link: Link, notifier: Notifier, connect: Sequence[str]) -> int:
+    lonely_at = time.monotonic() + LONELY
+    while link.running:
         notifier.feed()
+        if connect and time.monotonic() >= lonely_at and not link.peers():
+            log.warning("no host reached yet at %s: check address and port; trying on", ", ".join(connect))
+            lonely_at = float("inf")
         time.sleep(notifier.nap(NAP))
     log.error("the link has ended by itself; start it again")
     return 1

@@ -19,6 +19,7 @@ from .peers import PeerState
 from .status import TopicLinkStats
 
 GAP_WAIT = 0.5  # seconds a queued topic waits for what it asked for; well below the lease
+HEAD_GRACE = 0.15  # seconds a sample may come after the head that tells of it
 WAITING = 256  # samples of one stream kept while a gap is asked for
 STUCK_PAUSE = 1.0  # seconds a node is left alone after a process stopped inside it
 
@@ -42,6 +43,8 @@ class Mirror:
         self.waiting: dict[int, tuple[SampleHeader, bytes]] = {}
         self._asked = 0.0  # when the present gap was asked for; 0: none
         self._asked_last = 0  # the last number asked for
+        self._owed = 0  # the newest number that a head told of, if it was news
+        self._owed_since = 0.0
         self._lock = Lock()  # a stream's samples and its heads come in different threads
         self.stuck_until = 0.0
         self.refused = ""  # why it has no node, as last told
@@ -109,23 +112,34 @@ class Mirror:
         if self.newest >= self._asked_last:
             self._asked = 0.0
 
-    def give_up(self, now: float) -> None:
-        """Count as lost what was asked for and did not come, and go on with what waits."""
+    def look_after(self, now: float, ask: AskGap) -> None:
+        """Give up what did not come, ask for what a head has shown to be missing; called a few times a second."""
         with self._lock:
-            if not self._asked or now - self._asked < GAP_WAIT:
-                return
-            while self.waiting:
-                first = min(self.waiting)
-                header, payload = self.waiting.pop(first)
-                if first > self.newest:
-                    self._take(header, payload)
-            if self.newest < self._asked_last:
-                self._count_lost(self._asked_last - self.newest)
-                self.newest = self._asked_last
-            self._asked = 0.0
+            if self._asked and now - self._asked >= GAP_WAIT:
+                self._give_up()
+            if self._owed > self.newest and not self._asked and now - self._owed_since >= HEAD_GRACE:
+                if self.advert.queue_length == 1:  # only the newest is worth asking for
+                    self._count_lost(self._owed - 1 - self.newest)
+                    self.newest = self._owed - 1
+                self._ask(self._owed, ask)
 
-    def head(self, base: int, sequence: int, ask: AskGap) -> None:
-        """Learn what the sender owes: a lost first or last sample shows here."""
+    def _give_up(self) -> None:
+        """Count as lost what was asked for and did not come, and go on with what waits."""
+        while self.waiting:
+            first = min(self.waiting)
+            header, payload = self.waiting.pop(first)
+            if first > self.newest:
+                self._take(header, payload)
+        if self.newest < self._asked_last:
+            self._count_lost(self._asked_last - self.newest)
+            self.newest = self._asked_last
+        self._asked = 0.0
+
+    def head(self, base: int, sequence: int) -> None:
+        """Learn what the sender owes: a lost first or last sample shows here.
+
+        A head may overtake the samples it tells of, which travel in another class; so it is acted upon later.
+        """
         with self._lock:
             if self.base:
                 self.base = False
@@ -133,13 +147,9 @@ class Mirror:
             elif base < self._assumed:
                 self._count_lost(self._assumed - base)
             self._assumed = 0
-            if sequence <= self.newest or self.waiting:
-                return
-            if self.advert.queue_length > 1:
-                self._ask(sequence, ask)
-            else:
-                self._count_lost(sequence - self.newest)
-                self.newest = sequence
+            if sequence > self.newest and self._owed <= self.newest:
+                self._owed = sequence
+                self._owed_since = monotonic()
 
     def begin(self) -> None:
         """Somebody here subscribes (again): the next sample sets the base, unless the peer was only cut off."""
@@ -159,6 +169,7 @@ class Mirror:
             self.demand_us = None
             self.waiting.clear()
             self._asked = 0.0
+            self._owed = 0
 
     def _take(self, header: SampleHeader, payload: bytes) -> None:
         missing = header.sequence - self.newest - 1

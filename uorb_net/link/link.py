@@ -121,6 +121,11 @@ class Link:
     def __exit__(self, *exc: object) -> None:
         self.stop()
 
+    @property
+    def running(self) -> bool:
+        """Whether the link is started and its thread lives."""
+        return self._thread is not None and self._thread.is_alive()
+
     # -- what users ask ----------------------------------------------------------------------------
 
     def wait_for_peer(self, host: str, timeout: float | None = None) -> bool:
@@ -309,7 +314,7 @@ class Link:
 
     def _tick(self, now: float) -> None:
         for mirror in self._mirrors.all.values():
-            mirror.give_up(now)
+            mirror.look_after(now, self._ask_gap)
         for peer, rows in self._offers.heads(now).items():
             self._say(peer, control.Heads(rows))
 
@@ -373,7 +378,7 @@ class Link:
         for topic, instance, base, sequence in message.heads:
             mirror = self._mirrors.all.get((state.peer, topic, instance))
             if mirror is not None and mirror.demand_us is not None:
-                mirror.head(base, sequence, self._ask_gap)
+                mirror.head(base, sequence)
 
     def _on_gap(self, state: PeerState, message: control.Gap, now_us: int) -> None:
         self._offers.resend(state.peer, message)

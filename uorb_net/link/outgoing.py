@@ -22,7 +22,7 @@ HEADS_FOR = 4.0  # seconds: longer than a cut that the default lease survives
 class Flow:
     """What one peer gets of one node."""
 
-    __slots__ = ("base", "changed", "held", "interval_us", "last_us", "peer", "sequence")
+    __slots__ = ("base", "changed", "held", "interval_us", "last_us", "latched", "peer", "sequence")
 
     def __init__(self, peer: Peer, interval_us: int, base: int) -> None:
         self.peer = peer
@@ -31,6 +31,7 @@ class Flow:
         self.base = base  # the publication before the first that this flow owes its peer
         self.sequence = base  # the newest sent
         self.changed = monotonic()  # when that changed, for how long to repeat it
+        self.latched = 0  # the number that went out as latched, when the flow began
         self.held = False  # a newer sample waits for the interval to pass
 
     def due(self, now_us: int) -> bool:
@@ -99,7 +100,8 @@ class LocalNode:
         if newest is None:
             return 0
         flow.passed(hrt_absolute_time())
-        return self._send(flow, newest, channel, latched=True)
+        flow.latched = newest.sequence
+        return self._send(flow, newest, channel)
 
     def _newest(self) -> Sample | None:
         """Return the newest local sample of the present advertisement before the position."""
@@ -146,30 +148,32 @@ class LocalNode:
                 flow.held = True
         return sent
 
-    def _send(self, flow: Flow, sample: Sample, channel: Channel, latched: bool = False) -> int:
+    def _send(self, flow: Flow, sample: Sample, channel: Channel) -> int:
         if sample.sequence <= flow.sequence:
             return 0
         withheld = sample.sequence - flow.sequence - 1 if flow.interval_us else 0
         flow.sequence = sample.sequence
         flow.changed = monotonic()
-        age_us = max(hrt_absolute_time() - sample.published_us, 0)
-        header = SampleHeader(sample.sequence, sample.published_us, age_us, withheld, latched)
-        label = self.label
-        channel.send_message(flow.peer, label.topic, label.instance, header, sample.payload)
+        self._put(flow, sample, withheld, channel)
         return 1
+
+    def _put(self, flow: Flow, sample: Sample, withheld: int, channel: Channel) -> None:
+        age_us = max(hrt_absolute_time() - sample.published_us, 0)
+        latched = sample.sequence == flow.latched
+        header = SampleHeader(sample.sequence, sample.published_us, age_us, withheld, latched)
+        channel.send_message(flow.peer, self.label.topic, self.label.instance, header, sample.payload)
 
     def resend(self, peer: Peer, first: int, last: int, channel: Channel) -> int:
         """Send publications `first` to `last` once more, as far as the ring still has them."""
         sent = 0
-        if peer not in self.flows:
+        flow = self.flows.get(peer)
+        if flow is None:
             return 0
         generation = self.mapping.words[W_G] & GENERATION
         for number in range(max(generation - self.mapping.slots + 1, 0), generation):
             sample = read(self.mapping, number)
             if sample is not None and not sample.origin and first <= sample.sequence <= last:
-                age_us = max(hrt_absolute_time() - sample.published_us, 0)
-                header = SampleHeader(sample.sequence, sample.published_us, age_us)
-                channel.send_message(peer, self.label.topic, self.label.instance, header, sample.payload)
+                self._put(flow, sample, 0, channel)
                 sent += 1
         return sent
 
