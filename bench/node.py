@@ -8,6 +8,7 @@ import json
 import mmap
 import os
 from collections.abc import Callable
+from math import inf
 
 import uorb_net as uorb
 from bench.echo import CODEC, runtime_folder, sample
@@ -40,6 +41,7 @@ def run(seconds: float = 4.0) -> list[Row]:
                 _check(shared, seconds / 3),
                 _copy("shared bus", shared, seconds / 3),
                 _copy("private bus", private, seconds / 3),
+                _prototype(private, seconds / 3),
             ]
         del os.environ["UORB_RUNTIME_DIR"]
     return rows
@@ -80,6 +82,51 @@ def _copy(name: str, broker: uorb.Broker, seconds: float) -> Row:
     measured = alternate(timed(ours), raw, ROUNDS, n)
     close()
     return row(f"publish + check + copy, {name} / raw Zenoh", measured, GOAL_COPY)
+
+
+class Prototype:
+    """The least that could be called a bus: a reference and a count in one process, no lock, no encoding."""
+
+    def __init__(self) -> None:
+        self.message: object = None
+        self.generation = 0
+
+    def publish(self, message: object) -> None:
+        """Hand over a reference."""
+        self.message = message
+        self.generation += 1
+
+    def check(self, position: int) -> bool:
+        """Tell whether there is something new."""
+        return self.generation != position
+
+    def copy(self) -> object:
+        """Return the reference."""
+        return self.message
+
+
+def _prototype(broker: uorb.Broker, seconds: float) -> Row:
+    publication = broker.advertise(SensorCombined)
+    subscription = broker.subscribe(SensorCombined)
+    bare = Prototype()
+
+    def ours(n: int) -> None:
+        for number in range(n):
+            publication.publish(sample(number))
+            if subscription.check():
+                subscription.copy()
+
+    def control(n: int) -> None:
+        for number in range(n):
+            bare.publish(sample(number))
+            if bare.check(number):
+                bare.copy()
+
+    n = count_for(timed(control), seconds / (4 * ROUNDS))
+    measured = alternate(timed(ours), timed(control), ROUNDS, n)
+    return row(
+        "publish + check + copy / a bare reference", measured, inf, "for scale: no lock, no encoding, one process"
+    )
 
 
 def _zenoh() -> tuple[Timed, Callable[[], None]]:

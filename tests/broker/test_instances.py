@@ -122,6 +122,19 @@ def test_unadvertise_is_counted(broker: uorb.Broker) -> None:
         subscription.copy_with_info()
 
 
+def test_unadvertised_between_check_and_copy(broker: uorb.Broker, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`update` is None then, and iteration waits on: only `copy` tells of it by an exception."""
+    publication = broker.advertise(OrbTest, OrbTest())
+    subscription = broker.subscribe(OrbTest)
+
+    def check(_: object) -> bool:
+        publication.unadvertise()
+        return True
+
+    monkeypatch.setattr(uorb.Subscription, "check", check)
+    assert subscription.update() is None
+
+
 def test_publishing_after_unadvertise(broker: uorb.Broker) -> None:
     """The publication is spent: ClosedError (EBADF), also where another keeps the topic."""
     spent = broker.advertise(OrbTest)

@@ -339,6 +339,23 @@ def test_a_process_stopped_with_the_directory_lock(shared: uorb.Broker, script: 
     shared.advertise(OrbTest)
 
 
+def test_joining_while_the_directory_lock_is_held(shared: uorb.Broker, script: Start) -> None:
+    """A process that cannot join is told by whom, too."""
+    holder = script("with uorb.Broker()._directory.hold(): say('held'); hear()")
+    holder.hear()
+    newcomer = script(
+        """
+from uorb_net.broker.shared import SharedDirectory
+SharedDirectory.hold.__wrapped__.__defaults__ = (0.1,)
+try: uorb.Broker()
+except uorb.BusError as error: say(error.errno, error)
+"""
+    )
+    answer = newcomer.hear()
+    assert answer.startswith("11 ")
+    assert f"process {holder.pid} " in answer
+
+
 def test_unadvertising_while_the_bus_cannot_be_told(
     shared: uorb.Broker, script: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:

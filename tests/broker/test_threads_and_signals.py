@@ -110,6 +110,35 @@ def test_a_handler_that_publishes_in_the_act(broker: uorb.Broker) -> None:
     assert [m.val for m in iter(subscription.update, None)] == [1, 2, 3, 4]
 
 
+def test_samples_put_aside_may_be_written_by_another_thread(broker: uorb.Broker) -> None:
+    """A thread that goes to write what a handler left, and finds it written, goes on."""
+
+    class Taken(list[Any]):
+        def __bool__(self) -> bool:
+            return True
+
+    publication = broker.advertise(OrbTest)
+    publication._node._deferred = Taken()
+    publication.publish(OrbTest())
+    assert broker.topics()[0].generation == 1
+
+
+def test_iterating_while_a_publisher_comes_and_goes(broker: uorb.Broker, in_thread: InThread) -> None:
+    """A reader in a loop never sees an exception, and the newest sample in the end."""
+    subscription = broker.subscribe(OrbTest)
+
+    def read() -> object:
+        return next(message.val for message in subscription if message.val >= 400)
+
+    task = in_thread(read)
+    for value in range(401):
+        with broker.advertise(OrbTest) as publication:
+            publication.publish(OrbTest(val=value))
+            while value == 400 and not task.done():
+                task.thread.join(0.01)
+    assert task.result() == 400
+
+
 def test_unadvertise_while_another_thread_publishes(broker: uorb.Broker, in_thread: InThread) -> None:
     """The publishing thread gets ClosedError, never another error, and nothing more is written."""
     for _ in range(60):

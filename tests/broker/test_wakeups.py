@@ -144,6 +144,14 @@ def test_a_wake_up_races_with_arming(shared: uorb.Broker, monkeypatch: pytest.Mo
     assert looks == [True] * 100
 
 
+def test_a_sleeper_found_dead_by_two_threads(shared: uorb.Broker, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second finds its descriptor gone, and goes on."""
+    directory = shared._directory
+    monkeypatch.setattr(directory, "open_end", lambda number: True)
+    directory.poke(12345)
+    assert directory.fds.get(12345) is None
+
+
 def test_a_fifo_full_of_wake_ups_blocks_nobody(shared: uorb.Broker, script: Start) -> None:
     """A stopped sleeper's FIFO may fill up: publishing goes on, and it wakes when it goes on."""
     reader = script(READER_OF_MANY)
