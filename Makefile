@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   := .venv
 PY     := $(VENV)/bin/python
 
-.PHONY: demo test bench lint clean
+.PHONY: demo test bench soak lint clean
 
 demo: $(VENV)/.user
 	$(PY) -m uorb_net.cli demo $(ARGS)
@@ -15,6 +15,10 @@ lint: $(VENV)/.dev
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
+
+# The long forms of the storms: an hour's worth of kills and wake-ups in some minutes.
+soak: $(VENV)/.dev
+	UORB_STORM_KILLS=3000 UORB_WAKEUP_ROUNDS=1000000 $(PY) -m pytest tests/broker/test_storm.py tests/broker/test_wakeups.py -v $(ARGS)
 
 bench: $(VENV)/.dev
 	$(PY) -m bench $(ARGS)

@@ -1,6 +1,6 @@
 """A node under fire: publishers and readers killed and stopped at random instants, and born again.
 
-UORB_STORM_KILLS sets how many are killed (80); `make soak` runs more.
+UORB_STORM_KILLS sets how many are killed (300); `make soak` runs more.
 """
 
 import mmap
@@ -20,7 +20,7 @@ from uorb_net.msg import OrbTestLarge
 if TYPE_CHECKING:
     from tests.conftest import Script
 
-KILLS = int(os.environ.get("UORB_STORM_KILLS", "80"))
+KILLS = int(os.environ.get("UORB_STORM_KILLS", "300"))
 SEED = int(os.environ.get("UORB_STORM_SEED", "0")) or int.from_bytes(os.urandom(4), "little")
 
 # Forks publishers and readers on request: a birth costs milliseconds, so that kills can come close together.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tests.conftest import Script
 
 Start = Callable[..., "Script"]
-ROUNDS = int(os.environ.get("UORB_WAKEUP_ROUNDS", "10000"))
+ROUNDS = int(os.environ.get("UORB_WAKEUP_ROUNDS", "100000"))
 
 ECHO = """
 broker = uorb.Broker()
