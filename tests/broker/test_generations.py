@@ -3,6 +3,7 @@
 import pytest
 
 import uorb_net as uorb
+from uorb_net.broker.layout import W_FLOOR, W_G
 from uorb_net.msg import OrbTest, OrbTestMedium
 
 QUEUE = 16  # ORB_QUEUE_LENGTH of OrbTestMedium
@@ -240,3 +241,20 @@ def test_a_first_message_given_to_advertise_is_published(broker: uorb.Broker) ->
     with pytest.raises(uorb.TopicMismatchError):
         broker.advertise("orb_test", OrbTestMedium())
     assert not broker.exists("orb_test")
+
+
+@pytest.mark.parametrize("start", [(1 << 31) - 3, (1 << 32) - 3, (1 << 53) - 3, (1 << 61) - 3])
+def test_generations_never_wrap(broker: uorb.Broker, start: int) -> None:
+    """62 bits, at a million samples a second 146,000 years: no width on the way means anything."""
+    publication = broker.advertise(OrbTest, queue_length=4)
+    mapping = publication._node.mapping
+    mapping.words[W_G] = mapping.words[W_FLOOR] = start
+    subscription = broker.subscribe(OrbTest)
+    for value in range(6):
+        publication.publish(OrbTest(val=value))
+    assert subscription.pending == 4
+    assert [subscription.copy().val for _ in range(5)] == [2, 3, 4, 5, 5]
+    assert subscription.lost == 2
+    assert subscription.generation == start + 6
+    assert subscription.copy_with_info().info.generation == start + 6
+    assert broker.topics()[0].generation == start + 6
