@@ -4,6 +4,7 @@ import os
 import select
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -124,6 +125,18 @@ def until(condition: Callable[[], object], seconds: float = 5.0) -> bool:
 def eventually() -> Callable[..., bool]:
     """Wait for a condition: `eventually(condition, seconds)`."""
     return until
+
+
+@pytest.fixture
+def free_endpoint() -> Callable[[], str]:
+    """Make endpoints on loopback that nobody listens on."""
+
+    def make() -> str:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+    return make
 
 
 @pytest.fixture

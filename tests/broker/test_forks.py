@@ -151,7 +151,7 @@ pub.publish(msg.OrbTest(val=2))
         assert parent.ends() == -9
         started = monotonic()
         publication.publish(OrbTest(val=6))
-        assert monotonic() - started < 0.09
+        assert monotonic() - started < 0.5
     finally:
         script(f"os.kill({child}, 9); say('killed')").hear()
 

@@ -70,7 +70,7 @@ def test_a_wait_survives_a_replacement(shared: uorb.Broker, script: Start, in_th
     published = monotonic()
     woken = task.result()
     assert isinstance(woken, float)
-    assert woken - published < 0.3
+    assert woken - published < 0.5
     assert subscription.copy().val == 3
 
 
@@ -174,9 +174,9 @@ def test_a_mover_killed_in_the_act(
     assert mover.ends() == -9
     started = monotonic()
     publication.publish(OrbTest(val=3))
-    assert monotonic() - started < 0.1
+    assert monotonic() - started < 0.5
     assert task.result() is True
-    assert monotonic() - started < 1.3
+    assert monotonic() - started < 2.0
     assert subscription.copy().val == 3
     assert not publication._node.mapping.words[W_G] & MOVED
     reader = script(

@@ -94,7 +94,7 @@ pub.publish(msg.OrbTest(val=7))
     assert writer.ends() == -9
     started = monotonic()
     assert reader.hear() == "7"
-    assert monotonic() - started < 1.3
+    assert monotonic() - started < 2.0
     del keeper
 
 

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -105,17 +104,10 @@ class Reader:
         return result["rows"], result["lost"]
 
 
-def free_port() -> int:
-    """Return a TCP port nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.fixture
-def hosts(tmp_path: Path) -> Iterator[tuple[Host, Host]]:
+def hosts(tmp_path: Path, free_endpoint: Callable[[], str]) -> Iterator[tuple[Host, Host]]:
     """An autopilot that listens and a companion that connects, both started."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     pair = (
         Host("autopilot", ["--listen", endpoint], tmp_path),
         Host("companion", ["--connect", endpoint], tmp_path),

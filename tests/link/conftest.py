@@ -1,8 +1,6 @@
 """Hosts joined by a real Zenoh link over loopback TCP, or by a network in memory: one suite, two places."""
 
-import socket
 from collections.abc import Callable, Iterator
-from time import monotonic, sleep
 
 import pytest
 
@@ -10,38 +8,22 @@ import uorb_net as uorb
 from communicator import Channel, MemoryNetwork, ZenohChannel
 
 
-def free_port() -> int:
-    """Return a TCP port nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def until(condition: Callable[[], object], seconds: float = 5.0) -> bool:
-    """Wait until `condition` holds, at most `seconds`."""
-    deadline = monotonic() + seconds
-    while not condition():
-        if monotonic() > deadline:
-            return False
-        sleep(0.002)
-    return True
-
-
 class Vehicle:
     """Hosts of one vehicle, each a private bus with its link."""
 
-    def __init__(self, kind: str) -> None:
+    def __init__(self, kind: str, free_endpoint: Callable[[], str]) -> None:
         self.kind = kind
         self.network = MemoryNetwork()
-        self.ports: list[int] = []
+        self.free_endpoint = free_endpoint
+        self.endpoints: list[str] = []
         self.links: list[uorb.Link] = []
 
     def channel(self) -> Channel:
         """Return a channel that reaches all channels made before."""
         if self.kind == "memory":
             return self.network.channel()
-        self.ports.append(free_port())
-        *others, own = [f"tcp/127.0.0.1:{port}" for port in self.ports]
+        self.endpoints.append(self.free_endpoint())
+        *others, own = self.endpoints
         return ZenohChannel(listen=[own], connect=others)
 
     def host(self, name: str, broker: uorb.Broker | None = None) -> tuple[uorb.Broker, uorb.Link]:
@@ -62,14 +44,8 @@ class Vehicle:
 
 
 @pytest.fixture(params=["memory", "zenoh"])
-def vehicle(request: pytest.FixtureRequest) -> Iterator[Vehicle]:
+def vehicle(request: pytest.FixtureRequest, free_endpoint: Callable[[], str]) -> Iterator[Vehicle]:
     """A vehicle over each kind of channel."""
-    vehicle = Vehicle(request.param)
+    vehicle = Vehicle(request.param, free_endpoint)
     yield vehicle
     vehicle.close()
-
-
-@pytest.fixture
-def eventually() -> Callable[..., bool]:
-    """Wait for a condition."""
-    return until

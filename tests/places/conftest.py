@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -144,10 +143,7 @@ class OtherHost(Elsewhere):
 
     remote = True
 
-    def __init__(self, broker: uorb.Broker, far: str) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    def __init__(self, broker: uorb.Broker, far: str, endpoint: str) -> None:
         self.link = uorb.Link(broker, ZenohChannel(listen=[endpoint]), host="near").start()
         super().__init__(broker, {"UORB_RUNTIME_DIR": far}, endpoint)
         assert self.link.wait_for_peer("far", 10.0)
@@ -175,7 +171,10 @@ def folder() -> Iterator[Callable[[], str]]:
 
 @pytest.fixture(params=["private", "thread", "process", "host"])
 def place(
-    request: pytest.FixtureRequest, folder: Callable[[], str], monkeypatch: pytest.MonkeyPatch
+    request: pytest.FixtureRequest,
+    folder: Callable[[], str],
+    free_endpoint: Callable[[], str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Place]:
     """A bus with its publishers in one of the places."""
     near = folder()
@@ -187,6 +186,6 @@ def place(
     elif request.param == "process":
         made = Elsewhere(broker, {"UORB_RUNTIME_DIR": near})
     else:
-        made = OtherHost(broker, folder())
+        made = OtherHost(broker, folder(), free_endpoint())
     yield made
     made.close()
