@@ -41,7 +41,8 @@ def main() -> None:
             for subscription in uorb.poll(list(names), 0.02):
                 while subscription.check():
                     rows[names[subscription]].append(flat(subscription.copy()))
-        lost = {name: subscription.lost for subscription, name in names.items()}
+        on_the_way = {_name((s.status.topic, s.status.instance)): s.link_lost for s in broker.survey()}
+        lost = {name: subscription.lost + on_the_way[name] for subscription, name in names.items()}
     with open(sys.argv[1], "w") as out:
         json.dump({"rows": rows, "lost": lost}, out)
 
